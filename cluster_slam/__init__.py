@@ -1,0 +1,31 @@
+"""Which flower cluster is this? Landmark SLAM with clusters of flowers.
+
+The public calls are loaded when they are first used, so that ``import cluster_slam`` stays quick.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from cluster_slam.evaluation import evaluate
+    from cluster_slam.io.session import open_session
+    from cluster_slam.pipeline import smooth
+    from cluster_slam.simulate import simulate
+
+_PUBLIC = {
+    "evaluate": "cluster_slam.evaluation",
+    "open_session": "cluster_slam.io.session",
+    "simulate": "cluster_slam.simulate",
+    "smooth": "cluster_slam.pipeline",
+}
+__all__ = ["__version__", "evaluate", "open_session", "simulate", "smooth"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PUBLIC:
+        return getattr(import_module(_PUBLIC[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

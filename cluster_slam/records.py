@@ -1,0 +1,194 @@
+"""What passes between the stages: frozen records, validated once where they are made.
+
+Shapes: n frames, m observations, f flowers, c clusters. Units: metres, radians, seconds. Arrays are float64 unless
+said otherwise and are never modified in place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cluster_slam.geometry import Array
+
+IntArray = NDArray[np.int64]
+PoseFrame = Literal["T_world_camera", "T_world_flange"]
+PoseError = Literal["absolute", "odometry"]
+State = Literal["tentative", "confirmed", "lost"]
+CLUTTER = -1  # the id of an observation that is taken for a false one
+
+
+class RejectReason(IntEnum):
+    """Why an observation has no landmark, or that it has one."""
+
+    ACCEPTED = 0
+    POSITION_GATE = 1  # no landmark predicted within the gate
+    DESCRIPTOR_GATE = 2  # the cluster's descriptor does not fit
+    GEOMETRY_GATE = 3  # the members' geometry does not fit
+    TAKEN = 4  # another observation of the frame fits the landmark better
+    UNCONFIRMED = 5  # seen too rarely for a landmark
+    OUTLIER = 6  # assigned, but found inconsistent when all was smoothed
+
+
+@dataclass(frozen=True, slots=True)
+class StatedNoise:
+    """Standard deviations that a session states (``[noise]``); None where it does not state them."""
+
+    pose_translation: float = 0.001  # m
+    pose_rotation: float = 0.002  # rad
+    odometry_translation: float = 0.05  # m per m travelled
+    odometry_rotation: float = 0.1  # rad per rad turned
+    hand_eye_translation: float = 0.005  # m
+    hand_eye_rotation: float = 0.01  # rad
+    flower: float = 0.005  # m, isotropic, where no covariance is given
+    pixel: float = 1.0  # px, of u and of v
+    depth: float = 0.006  # sigma of the depth = depth * z^2, z in m
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Flowers as single frames saw them, in the order of the input's rows."""
+
+    frame: IntArray  # (m,) index of the frame
+    points: Array  # (m, 3) camera frame, m
+    covs: Array  # (m, 3, 3) camera frame, m^2
+    scores: Array  # (m,) detector's score, NaN where there is none
+    has_covariance: bool = True  # False where covs come from StatedNoise.flower alone
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """Ground truth, for evaluation and simulation only. Any part may be missing (None)."""
+
+    T_world_camera: Array | None = None  # (n, 4, 4)
+    flower_ids: IntArray | None = None  # (m,) -1 = false detection
+    cluster_ids: IntArray | None = None  # (m,)
+    rest_flower_ids: IntArray | None = None  # (f,)
+    rest_cluster_ids: IntArray | None = None  # (f,)
+    rest_positions: Array | None = None  # (f, 3) world
+    T_map_world: Array | None = None  # (4, 4)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Session:
+    """One recording: poses as they were given, and flowers in the camera frame."""
+
+    id: str
+    stamps: Array  # (n,) s, strictly increasing
+    poses: Array  # (n, 4, 4) of the frame named by pose_frame
+    pose_frame: PoseFrame
+    pose_error: PoseError
+    T_flange_camera: Array | None  # (4, 4) as measured; None where poses are the camera's
+    noise: StatedNoise
+    observations: Observations
+    plant: str | None = None
+    path: Path | None = None
+    level: int = 3
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def n_frames(self) -> int:
+        return len(self.stamps)
+
+    @property
+    def T_world_camera(self) -> Array:
+        """Camera poses (n, 4, 4) as the given poses and the measured hand-eye transform have them."""
+        return self.poses if self.T_flange_camera is None else self.poses @ self.T_flange_camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Flowers:
+    """Flowers at rest in the world."""
+
+    ids: IntArray  # (f,) >= 0, increasing
+    cluster_ids: IntArray  # (f,)
+    positions: Array  # (f, 3)
+    covs: Array  # (f, 3, 3)
+    first_seen: Array  # (f,) s
+    last_seen: Array  # (f,) s
+    n_observations: IntArray  # (f,)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clusters:
+    """Clusters at rest in the world: the centroid is the unweighted mean of the members."""
+
+    ids: IntArray  # (c,) >= 0, increasing
+    positions: Array  # (c, 3)
+    covs: Array  # (c, 3, 3)
+    n_flowers: IntArray  # (c,)
+    descriptors: Array  # (c, 2) inertia (m^2), mean distance (m)
+    descriptor_covs: Array  # (c, 2, 2)
+    first_seen: Array  # (c,) s
+    last_seen: Array  # (c,) s
+    n_observations: IntArray  # (c,)
+    states: tuple[State, ...]  # (c,)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drift:
+    """Where each cluster's centroid was at each frame that saw it."""
+
+    frame: IntArray  # (d,)
+    cluster_ids: IntArray  # (d,)
+    positions: Array  # (d, 3) world
+    covs: Array  # (d, 3, 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """Hand-eye transform, its covariance of the tangent applied on the right, and what could not be observed."""
+
+    T_flange_camera: Array  # (4, 4)
+    cov: Array  # (6, 6)
+    unobserved: tuple[str, ...] = ()  # directions in words; they stay at the prior
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Diagnostics:
+    """What the report shows beside the result."""
+
+    nis: (
+        Array  # (m,) chi-square of each accepted observation after smoothing (3 degrees of freedom), NaN else
+    )
+    reasons: IntArray  # (m,) RejectReason
+    estimated_noise: dict[str, float] = field(
+        default_factory=dict
+    )  # same keys as StatedNoise, and what else is known
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Result:
+    """All that a result folder holds."""
+
+    session: Session
+    T_world_camera: Array  # (n, 4, 4)
+    flower_ids: IntArray  # (m,) -1 = clutter
+    cluster_ids: IntArray  # (m,) -1 exactly where flower_ids is
+    flowers: Flowers
+    clusters: Clusters
+    drift: Drift
+    calibration: Calibration | None
+    diagnostics: Diagnostics
+    command: str = "smooth"
+    config: dict[str, Any] = field(default_factory=dict)
+    seed: int = 0
+    timings_s: dict[str, float] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    merged: tuple[tuple[int, int], ...] = ()
+    status: Literal["ok", "poor"] = "ok"
