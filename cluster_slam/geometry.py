@@ -118,9 +118,7 @@ def quaternion_from_rotation(R: Array) -> Array:
     """
     r = R
     trace = r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2]
-    four = np.stack(
-        [2 * r[..., 0, 0] - trace, 2 * r[..., 1, 1] - trace, 2 * r[..., 2, 2] - trace, trace], axis=-1
-    )
+    four = np.stack([2 * r[..., 0, 0] - trace, 2 * r[..., 1, 1] - trace, 2 * r[..., 2, 2] - trace, trace], axis=-1)
     products = np.empty((*R.shape[:-2], 4, 4))  # 4 q_i q_j
     for i in range(4):
         products[..., i, i] = 1.0 + four[..., i]
@@ -131,7 +129,8 @@ def quaternion_from_rotation(R: Array) -> Array:
     best = four.argmax(-1)
     q = np.take_along_axis(products, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.where(q[..., 3:] < 0, -q, q)
+    flipped: Array = np.where(q[..., 3:] < 0, -q, q)
+    return flipped
 
 
 def pose_from_tum(rows: Array) -> Array:

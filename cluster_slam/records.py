@@ -162,13 +162,9 @@ class Calibration:
 class Diagnostics:
     """What the report shows beside the result."""
 
-    nis: (
-        Array  # (m,) chi-square of each accepted observation after smoothing (3 degrees of freedom), NaN else
-    )
+    nis: Array  # (m,) chi-square of each accepted observation after smoothing (3 degrees of freedom), NaN else
     reasons: IntArray  # (m,) RejectReason
-    estimated_noise: dict[str, float] = field(
-        default_factory=dict
-    )  # same keys as StatedNoise, and what else is known
+    estimated_noise: dict[str, float] = field(default_factory=dict)  # same keys as StatedNoise, and what else is known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
