@@ -75,6 +75,7 @@ class Truth:
     rest_cluster_ids: IntArray | None = None  # (f,)
     rest_positions: Array | None = None  # (f, 3) world
     T_map_world: Array | None = None  # (4, 4)
+    T_flange_camera: Array | None = None  # (4, 4) true hand-eye transform, where a simulation knows it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
