@@ -1,0 +1,134 @@
+"""One simulated recording: the world, the arm, the camera, and what is known about them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cluster_slam.geometry import Array
+from cluster_slam.io.session_writer import Intrinsics, write_session
+from cluster_slam.records import CLUTTER, Observations, Session, StatedNoise, Truth
+from cluster_slam.simulate.camera_path import HandEye, camera_path, measured_poses, mount_camera
+from cluster_slam.simulate.config import SimulateConfig
+from cluster_slam.simulate.leaves import grow_leaves
+from cluster_slam.simulate.motion import Motion, flower_positions, move
+from cluster_slam.simulate.plant import Plant, grow_plant
+from cluster_slam.simulate.sensor import Detections, detect, intrinsics_of, visible_flowers
+
+_START_S = 1_777_888_800.0  # 2026-05-04 10:00 UTC
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulated:
+    """A recording and all that is true about it."""
+
+    config: SimulateConfig
+    session: Session
+    truth: Truth
+    flower_positions: Array  # (n, f, 3) world, at each frame; flower ids are 0 to f - 1
+    visible: NDArray[np.bool_]  # (n, f) in view and not hidden
+    plant: Plant
+    motion: Motion
+    hand_eye: HandEye
+    intrinsics: Intrinsics
+
+
+def simulate(config: SimulateConfig, out: Path, *, seed: int) -> None:
+    """Write a simulated session with its truth into the folder ``out``, whole or not at all.
+
+    Raises
+    ------
+    ConfigError
+        The plant does not fit its own spacings.
+    OutputError
+        ``out`` holds something that is no earlier session, or cannot be written.
+    """
+    made = simulate_session(config, seed=seed)
+    frames = np.unique(np.linspace(0, made.session.n_frames - 1, 10).round().astype(np.int64))
+    write_session(
+        out,
+        made.session,
+        made.truth,
+        intrinsics=made.intrinsics,
+        timed_frames=frames,
+        timed_positions=made.flower_positions[frames],
+    )
+
+
+def simulate_session(config: SimulateConfig, *, seed: int) -> Simulated:
+    """Simulate a recording in memory. The same configuration and seed give the same arrays in any process."""
+    times = np.arange(config.n_frames) / config.fps
+    plant = grow_plant(config, rng=_rng(seed, "plant"))
+    motion = move(config, plant, times, rng=_rng(seed, "motion"))
+    flowers = flower_positions(plant, motion)
+    T_world_camera = camera_path(config, plant, times, rng=_rng(seed, "path"))
+    hand_eye = mount_camera(config, rng=_rng(seed, "mount"))
+    leaves = grow_leaves(config, plant, times, rng=_rng(seed, "leaves"))
+    visible = visible_flowers(config, T_world_camera, flowers, leaves)
+    detections = detect(config, T_world_camera, flowers, visible, leaves, rng=_rng(seed, "detections"))
+    observations, noise = _observe(config, detections, rng=_rng(seed, "scores"))
+    session = Session(
+        id=f"simulated-{seed}",
+        stamps=np.round(_START_S + times, 6),
+        poses=measured_poses(config, T_world_camera, hand_eye, rng=_rng(seed, "poses")),
+        pose_frame=config.pose_frame,
+        pose_error=config.pose_error,
+        T_flange_camera=hand_eye.measured if config.pose_frame == "T_world_flange" else None,
+        noise=noise,
+        observations=observations,
+        plant=f"simulated-{seed}",
+        level=config.level,
+    )
+    truth = _truth(plant, T_world_camera, detections)
+    return Simulated(config, session, truth, flowers, visible, plant, motion, hand_eye, intrinsics_of(config))
+
+
+def _rng(seed: int, part: str) -> np.random.Generator:
+    """One stream a part of the world, so that an option of one part does not reshuffle the others."""
+    return np.random.default_rng([seed, *part.encode()])
+
+
+def _truth(plant: Plant, T_world_camera: Array, detections: Detections) -> Truth:
+    cluster = plant.flower_cluster
+    is_true = detections.flower != CLUTTER
+    return Truth(
+        T_world_camera=T_world_camera,
+        flower_ids=detections.flower,
+        cluster_ids=np.where(is_true, cluster[detections.flower], CLUTTER),
+        rest_flower_ids=np.arange(len(cluster)),
+        rest_cluster_ids=cluster,
+        rest_positions=plant.flowers,
+    )
+
+
+def _observe(
+    config: SimulateConfig, detections: Detections, *, rng: np.random.Generator
+) -> tuple[Observations, StatedNoise]:
+    """Camera-frame points with the covariances that are stated, and the session's stated noise."""
+    pixels = detections.pixels
+    camera = intrinsics_of(config)
+    factor = config.stated_sigma_factor
+    pixel, depth = factor * max(config.pixel_sigma, 0.01), factor * max(config.depth_sigma, 1e-5)
+    covs = camera.point_covs(pixels, pixel, depth)
+    flower = float(np.sqrt(covs.trace(axis1=1, axis2=2).mean() / 3)) if len(covs) else 0.005 * factor
+    has_covariance = config.with_covariances or config.level == 2
+    if not has_covariance:
+        covs = np.tile(flower**2 * np.eye(3), (len(covs), 1, 1))
+    scores = np.full(len(pixels), np.nan)
+    if config.with_scores:
+        scores = np.where(detections.flower == CLUTTER, rng.beta(2, 3, len(pixels)), rng.beta(6, 2, len(pixels)))
+    noise = StatedNoise(
+        pose_translation=factor * max(config.pose_translation, 1e-5),
+        pose_rotation=factor * max(config.pose_rotation, 1e-5),
+        odometry_translation=factor * config.odometry_translation,
+        odometry_rotation=factor * config.odometry_rotation,
+        hand_eye_translation=factor * max(config.hand_eye_translation, 1e-3),
+        hand_eye_rotation=factor * max(config.hand_eye_rotation, 1e-3),
+        flower=flower,
+        pixel=pixel,
+        depth=depth,
+    )
+    return Observations(detections.frame, camera.lift(pixels), covs, scores, has_covariance), noise
