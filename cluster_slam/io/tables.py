@@ -20,6 +20,7 @@ from cluster_slam.records import IntArray
 NORM_TOLERANCE = 0.01  # a quaternion that is off unit norm by more is no rounding
 MAX_STAMP = 1e11  # s; the year 5138: larger stamps are in milli-, micro- or nanoseconds
 MAX_LENGTH = 1e7  # m; no plant or robot is farther away than this
+TUM_POSE = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 UNFINISHED = "the last row has no line end: is the file cut off?"
 
 
@@ -169,7 +170,7 @@ def read_tum(path: Path, what: str = "a TUM trajectory") -> Table:
     lines = read_text(path, what).split("\n")
     numbered = [(i, line.split("#", 1)[0]) for i, line in enumerate(lines, 1)]
     numbered = [(i, line) for i, line in numbered if line.strip()]
-    names = ["timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw"]
+    names = ("timestamp", *TUM_POSE)
     split = [line.split() for _, line in numbered]
     for (i, line), row in zip(numbered, split, strict=True):
         if len(row) != 8:
@@ -188,15 +189,15 @@ def _checked_trajectory(table: Table) -> Table:
         k = int((steps <= 0).argmax()) + 1
         stamp, before = table.columns["timestamp"][k], table.columns["timestamp"][k - 1]
         raise table.refuse(k, f"timestamp {stamp!s} after {before!s}, expected a later one (strictly increasing)")
-    check_lengths(table, ("tx", "ty", "tz"))
-    q = table.stack(("qx", "qy", "qz", "qw"))
+    check_lengths(table, TUM_POSE[:3])
+    q = table.stack(TUM_POSE[3:])
     norm = np.linalg.norm(q, axis=1)
     bad = np.abs(norm - 1.0) > NORM_TOLERANCE
     if bad.any():
         k = int(bad.argmax())
         raise table.refuse(k, f"quaternion qx qy qz qw of norm {norm[k]:.6g}, expected 1")
     unit = q / norm[:, None] if len(q) else q
-    columns = {**table.columns, **{name: unit[:, k] for k, name in enumerate(("qx", "qy", "qz", "qw"))}}
+    columns = {**table.columns, **{name: unit[:, k] for k, name in enumerate(TUM_POSE[3:])}}
     return Table(table.path, columns, table.rows, table.warnings)
 
 
