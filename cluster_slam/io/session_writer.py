@@ -226,12 +226,16 @@ def _write_truth(
     if truth.rest_positions is None or truth.rest_flower_ids is None or truth.rest_cluster_ids is None:
         return
     ids = [f"{f},{c}" for f, c in zip(truth.rest_flower_ids.tolist(), truth.rest_cluster_ids.tolist(), strict=True)]
-    rows = ("%s,%.10f,%.10f,%.10f\n" % (i, *p) for i, p in zip(ids, truth.rest_positions.tolist(), strict=True))
+    rows = (
+        f"{i},{x:.10f},{y:.10f},{z:.10f}\n" for i, (x, y, z) in zip(ids, truth.rest_positions.tolist(), strict=True)
+    )
     _write_lines(folder / "rest.csv", "flower_id,cluster_id,x,y,z\n", rows)
     if timed_frames is not None and timed_positions is not None:
         moments = zip(_stamps(session.stamps[timed_frames]), timed_positions.tolist(), strict=True)
         timed = (
-            "%s,%s,%.10f,%.10f,%.10f\n" % (t, i, *p) for t, rows in moments for i, p in zip(ids, rows, strict=True)
+            f"{t},{i},{x:.10f},{y:.10f},{z:.10f}\n"
+            for t, points in moments
+            for i, (x, y, z) in zip(ids, points, strict=True)
         )
         _write_lines(folder / "flowers.csv", "timestamp,flower_id,cluster_id,x,y,z\n", timed)
 

@@ -10,7 +10,7 @@ from cluster_slam.geometry import Array, inverse, se3_exp, se3_log, so3_exp
 from cluster_slam.simulate.config import SimulateConfig
 from cluster_slam.simulate.plant import Plant
 
-_SWEEP_HZ = 0.04  # slowest part of the sweep: one pass over the row and back in 25 s
+_SWEEP_HZ = 0.07  # slowest part of the sweep: one pass over the row and back in 14 s
 _MARGIN_M = 0.05  # the view wanders at least this far about the clusters
 
 
@@ -34,7 +34,7 @@ def camera_path(config: SimulateConfig, plant: Plant, times: Array, *, rng: np.r
 def _poses(config: SimulateConfig, plant: Plant, times: Array, phases: Array) -> Array:
     waves = _waves(times, phases)
     low, high = plant.centroids.min(0), plant.centroids.max(0)
-    reach = np.maximum((high - low) / 2, _MARGIN_M * config.scale) * [0.8, 0.3, 0.7]
+    reach = np.maximum((high - low) / 2, _MARGIN_M * config.scale) * [1.0, 0.3, 0.9]
     target = (low + high) / 2 + waves[:, :3] * reach
     azimuth, elevation = config.turn_rad * waves[:, 3], 0.15 + 0.6 * config.turn_rad * waves[:, 4]
     distance = (config.distance_min_m + (0.5 + 0.5 * waves[:, 5]) * _span(config)) * config.scale

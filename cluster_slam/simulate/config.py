@@ -22,14 +22,14 @@ class SimulateConfig:
     n_clusters: int = 12  # clusters of two flowers or more
     flowers_min: int = 3  # flowers of the smallest cluster
     flowers_max: int = 6  # flowers of the largest cluster; small ones are commoner
-    loose_share: float = 0.05  # of all flowers: single ones, each a cluster of one
+    loose_share: float = 0.04  # of all flowers: single ones, each a cluster of one
     cluster_spacing_m: float = 0.13  # least distance of two centroids
     neighbour_share: float = 0.5  # of clusters: set within 1.3 spacings of another, as along a real cane
     cluster_radius_min_m: float = 0.02  # flowers lie within this of the centroid in the tightest cluster
     cluster_radius_max_m: float = 0.05  # and within this in the widest
     flower_spacing_m: float = 0.012  # least distance of any two flowers: they are solid
-    plant_width_m: float = 1.2  # along the row
-    plant_height_m: float = 0.8
+    plant_width_m: float = 1.4  # along the row
+    plant_height_m: float = 0.9
     plant_depth_m: float = 0.35  # across the row
     scale: float = 1.0  # times every length of plant, leaves and camera distance
 
@@ -72,8 +72,8 @@ class SimulateConfig:
 
     # motion of the plant
     sway_m: float = 0.02  # largest displacement after touches
-    touches_per_minute: float = 4.0  # wind, insects, the arm itself
-    touch_reach_m: float = 0.15  # sigma of a touch's effect over distance
+    touches_per_minute: float = 8.0  # wind, insects, the arm itself
+    touch_reach_m: float = 0.2  # sigma of a touch's effect over distance
     sway_frequency_min_hz: float = 0.5
     sway_frequency_max_hz: float = 3.0
     damping_min: float = 0.05  # ratio to critical
@@ -113,6 +113,7 @@ HARD = replace(
     MODERATE,
     n_clusters=40,
     cluster_spacing_m=0.08,
+    plant_width_m=1.2,
     duration_s=60.0,
     sway_m=0.05,
     touches_per_minute=20.0,

@@ -11,6 +11,7 @@ from cluster_slam.simulate.config import SimulateConfig
 from cluster_slam.simulate.plant import Plant
 
 _AMBIENT_TIME_S = 0.3  # correlation time of the small sway
+_BEFORE_S = 3.0  # touches from so long before the first frame may still be felt
 _ALONG_STEM = 0.2  # how much of a push along the stem gets through
 
 
@@ -58,9 +59,8 @@ def _sway(config: SimulateConfig, plant: Plant, times: Array, rng: np.random.Gen
     oscillators = _oscillators(config, plant, rng)
     sway = np.zeros((len(times), len(plant.centroids), 3))
     envelope = np.zeros(len(plant.centroids))  # bound of what earlier touches left, at the time of the last
-    before = 0.0
-    n_touches = rng.poisson(config.touches_per_minute * config.duration_s / 60.0)
-    for start in np.sort(rng.uniform(0.0, config.duration_s, n_touches)):
+    before = -_BEFORE_S
+    for start in _touch_times(config, rng):
         envelope = envelope * np.exp(-oscillators.decay * (start - before))
         push = _push(config, plant, rng)
         size = np.linalg.norm(push, axis=1)
@@ -70,6 +70,12 @@ def _sway(config: SimulateConfig, plant: Plant, times: Array, rng: np.random.Gen
         envelope = envelope + allowed / oscillators.peak
         before = start
     return sway
+
+
+def _touch_times(config: SimulateConfig, rng: np.random.Generator) -> Array:
+    """Poisson times of touches, s, from a little before the first frame: a plant need not be calm at the start."""
+    span = config.duration_s + _BEFORE_S
+    return np.sort(rng.uniform(-_BEFORE_S, config.duration_s, rng.poisson(config.touches_per_minute * span / 60.0)))
 
 
 def _oscillators(config: SimulateConfig, plant: Plant, rng: np.random.Generator) -> _Oscillators:
@@ -97,7 +103,7 @@ def _push(config: SimulateConfig, plant: Plant, rng: np.random.Generator) -> Arr
     n = len(plant.centroids)
     place = plant.centroids[rng.integers(n)] + rng.normal(0.0, 0.05 * config.scale, 3)
     away = np.linalg.norm(plant.centroids - place, axis=1) / (config.touch_reach_m * config.scale)
-    size = config.sway_m * rng.uniform(0.4, 1.0) * np.exp(-0.5 * away**2) * rng.uniform(0.8, 1.0, n)
+    size = config.sway_m * rng.uniform(0.5, 1.0) * np.exp(-0.5 * away**2) * rng.uniform(0.8, 1.0, n)
     direction = rng.normal(size=3)
     direction = direction / np.linalg.norm(direction) + rng.normal(0.0, 0.15, (n, 3))
     direction -= (1 - _ALONG_STEM) * (direction * plant.tangents).sum(1, keepdims=True) * plant.tangents
@@ -109,7 +115,8 @@ def _turn(plant: Plant, sway: Array) -> Array:
     """Axis of the turn times the displacement: the cluster tips over in the direction of its sway."""
     out = plant.centroids - plant.attachments
     out = out / np.linalg.norm(out, axis=1, keepdims=True)
-    return np.cross(out, sway)
+    turn: Array = np.cross(out, sway)
+    return turn
 
 
 def _ambient(config: SimulateConfig, n: int, times: Array, rng: np.random.Generator) -> Array:
