@@ -36,7 +36,9 @@ def read_detections(
     InputError
         Names file, row, value and what was expected.
     """
-    table = read_table(folder / "detections.csv", ("timestamp", "u", "v", "depth"), ("score",), ("width", "height"))
+    table = read_table(
+        folder / "detections.csv", ("timestamp", "u", "v", "depth"), ("score",), ignored=("width", "height")
+    )
     check_lengths(table, ("u", "v", "depth"))
     camera = read_camera(folder / "camera.yaml")
     depths = table.columns["depth"]

@@ -6,7 +6,7 @@ import csv
 import difflib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import repeat
 from pathlib import Path
 
@@ -32,6 +32,7 @@ class Table:
     columns: Mapping[str, Array]  # each (n,)
     rows: IntArray  # (n,) row in the file; the header is row 1
     warnings: tuple[str, ...] = ()
+    words: Mapping[str, list[str]] = field(default_factory=dict)  # columns of text, each (n,)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -45,7 +46,14 @@ class Table:
         return InputError(f"{self.path}: row {self.rows[index]}: {text}")
 
 
-def read_table(path: Path, required: Sequence[str], optional: Sequence[str] = (), ignored: Sequence[str] = ()) -> Table:
+def read_table(
+    path: Path,
+    required: Sequence[str],
+    optional: Sequence[str] = (),
+    *,
+    ignored: Sequence[str] = (),
+    words: Sequence[str] = (),
+) -> Table:
     """A CSV table's columns as numbers.
 
     Parameters
@@ -58,6 +66,8 @@ def read_table(path: Path, required: Sequence[str], optional: Sequence[str] = ()
         Columns that may be there; a value that is empty or ``nan`` becomes NaN.
     ignored
         Columns that are known but not read.
+    words
+        Columns of text; those that are there are read.
 
     Returns
     -------
@@ -72,7 +82,7 @@ def read_table(path: Path, required: Sequence[str], optional: Sequence[str] = ()
     text = read_text(path, f"a table with the columns {','.join(required)}")
     lines = text.split("\n")
     header = _header(path, lines[0], required)
-    warnings = [_unknown(path, header, [*required, *optional, *ignored])]
+    warnings = [_unknown(path, header, [*required, *optional, *ignored, *words])]
     if len(lines) > 1 and lines[-1].strip():
         warnings.append(f"{path}: {UNFINISHED}")
     numbered = [(i, line) for i, line in enumerate(lines[1:], 2) if line.strip()]
@@ -85,6 +95,7 @@ def read_table(path: Path, required: Sequence[str], optional: Sequence[str] = ()
         {name: _numbers(path, name, rows, values, name in optional) for name, values in columns.items()},
         rows,
         tuple(w for w in warnings if w),
+        {name: [cell.strip() for cell in cells[header.index(name) :: len(header)]] for name in words if name in header},
     )
 
 

@@ -1,0 +1,183 @@
+"""A result folder, read back for evaluation and figures."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any, cast, get_args
+
+import numpy as np
+
+from cluster_slam.errors import InputError
+from cluster_slam.geometry import Array, pose_from_tum
+from cluster_slam.io.flowers import POINT_COV, symmetric
+from cluster_slam.io.frames import frames_of
+from cluster_slam.io.result import CLUSTER_COLUMNS, DRIFT_COLUMNS, FLOWER_COLUMNS
+from cluster_slam.io.tables import TUM_POSE, Table, read_table, read_tum
+from cluster_slam.io.text import read_text, shown
+from cluster_slam.records import (
+    Calibration,
+    Clusters,
+    Diagnostics,
+    Drift,
+    Flowers,
+    IntArray,
+    RejectReason,
+    Result,
+    Session,
+    State,
+)
+
+DESCRIPTOR = ("inertia", "mean_distance", "cov_ii", "cov_id", "cov_dd")  # NaN for clusters that have none
+
+
+def read_result(path: str | Path, session: Session) -> Result:
+    """Read a result folder.
+
+    Parameters
+    ----------
+    path
+        The folder.
+    session
+        The session that it was made from.
+
+    Raises
+    ------
+    InputError
+        Names file, row, value and what was expected, also where the result is of another session.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: {'is a file' if folder.exists() else 'missing'}, expected a result folder")
+    run = _json(folder / "run.json")
+    flower_ids, cluster_ids, diagnostics = _observations(folder / "observations.csv", session, run)
+    return Result(
+        session=session,
+        T_world_camera=_trajectory(folder / "trajectory.txt", session),
+        flower_ids=flower_ids,
+        cluster_ids=cluster_ids,
+        flowers=_flowers(folder / "flowers.csv"),
+        clusters=_clusters(folder / "clusters.csv"),
+        drift=_drift(folder / "drift.csv", session),
+        calibration=_calibration(folder / "calibration.toml"),
+        diagnostics=diagnostics,
+        command=str(run.get("command", "smooth")),
+        config=dict(run.get("config", {})),
+        seed=int(run.get("seed") or 0),
+        timings_s=dict(run.get("timings_s", {})),
+        counts=dict(run.get("counts", {})),
+        warnings=tuple(run.get("warnings", ())),
+        merged=tuple((int(a), int(b)) for a, b in run.get("merged", ())),
+        status="poor" if run.get("status") == "poor" else "ok",
+    )
+
+
+def _json(path: Path) -> dict[str, Any]:
+    text = read_text(path, "the record of a run (is this a result folder?)")
+    try:
+        content = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: row {error.lineno}: {error.msg}, expected JSON") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: row 1: {shown(text)}, expected an object")
+    return content
+
+
+def _trajectory(path: Path, session: Session) -> Array:
+    table = read_tum(path)
+    _same_length(table, session.n_frames, "frames of the session")
+    off = np.abs(table.columns["timestamp"] - session.stamps) > 1e-5
+    if off.any():
+        k = int(off.argmax())
+        stamp = table.columns["timestamp"][k]
+        raise table.refuse(k, f"timestamp {stamp!s}, expected {session.stamps[k]!s} as in the session's poses.txt")
+    return pose_from_tum(table.stack(TUM_POSE))
+
+
+def _same_length(table: Table, n: int, what: str) -> None:
+    if len(table) != n:
+        raise InputError(f"{table.path}: {len(table)} rows, expected {n}: one for each of the {what}")
+
+
+def _ints(table: Table, name: str) -> IntArray:
+    values = table.columns[name]
+    if (values != np.rint(values)).any():
+        k = int((values != np.rint(values)).argmax())
+        raise table.refuse(k, f"{name} is {values[k]!s}, expected a whole number")
+    return values.astype(np.int64)
+
+
+def _observations(path: Path, session: Session, run: dict[str, Any]) -> tuple[IntArray, IntArray, Diagnostics]:
+    table = read_table(path, ("timestamp", "flower_id", "cluster_id"), ("nis",), words=("reason",))
+    m = len(session.observations)
+    _same_length(table, m, "observations of the session")
+    flowers = _ints(table, "flower_id")
+    known = {reason.name.lower(): int(reason) for reason in RejectReason}
+    default = np.where(flowers >= 0, int(RejectReason.ACCEPTED), int(RejectReason.UNCONFIRMED)).tolist()
+    reasons = [known.get(word, d) for word, d in zip(table.words.get("reason", [""] * m), default, strict=True)]
+    nis = table.columns.get("nis", np.full(m, np.nan))
+    diagnostics = Diagnostics(nis, np.array(reasons, dtype=np.int64), dict(run.get("estimated_noise", {})))
+    return flowers, _ints(table, "cluster_id"), diagnostics
+
+
+def _columns(header: str) -> list[str]:
+    return [name for name in header.split(",") if name not in ("state", *DESCRIPTOR)]
+
+
+def _flowers(path: Path) -> Flowers:
+    table = read_table(path, _columns(FLOWER_COLUMNS))
+    return Flowers(
+        ids=_ints(table, "flower_id"),
+        cluster_ids=_ints(table, "cluster_id"),
+        positions=table.stack(("x", "y", "z")),
+        covs=symmetric(table.stack(POINT_COV)),
+        first_seen=table.columns["first_seen"],
+        last_seen=table.columns["last_seen"],
+        n_observations=_ints(table, "n_observations"),
+    )
+
+
+def _clusters(path: Path) -> Clusters:
+    table = read_table(path, _columns(CLUSTER_COLUMNS), DESCRIPTOR, words=("state",))
+    for name in DESCRIPTOR:
+        if name not in table.columns:
+            raise InputError(f"{path}: row 1: no column '{name}', expected {CLUSTER_COLUMNS}")
+    states = table.words.get("state", ["confirmed"] * len(table))
+    for k, state in enumerate(states):
+        if state not in get_args(State):
+            raise table.refuse(k, f"state is {shown(state)}, expected {', '.join(get_args(State))}")
+    return Clusters(
+        ids=_ints(table, "cluster_id"),
+        positions=table.stack(("x", "y", "z")),
+        covs=symmetric(table.stack(POINT_COV)),
+        n_flowers=_ints(table, "n_flowers"),
+        descriptors=table.stack(("inertia", "mean_distance")),
+        descriptor_covs=table.stack(("cov_ii", "cov_id", "cov_dd"))[:, [[0, 1], [1, 2]]],
+        first_seen=table.columns["first_seen"],
+        last_seen=table.columns["last_seen"],
+        n_observations=_ints(table, "n_observations"),
+        states=cast("tuple[State, ...]", tuple(states)),
+    )
+
+
+def _drift(path: Path, session: Session) -> Drift:
+    table = read_table(path, _columns(DRIFT_COLUMNS))
+    return Drift(
+        frame=frames_of(table, session.stamps),
+        cluster_ids=_ints(table, "cluster_id"),
+        positions=table.stack(("x", "y", "z")),
+        covs=symmetric(table.stack(POINT_COV)),
+    )
+
+
+def _calibration(path: Path) -> Calibration | None:
+    if not path.exists():
+        return None
+    try:
+        content = tomllib.loads(read_text(path, "a calibration"))
+        T = np.array(content["T_flange_camera"], dtype=np.float64).reshape(7)
+        cov = np.array(content["covariance"], dtype=np.float64).reshape(6, 6)
+    except (tomllib.TOMLDecodeError, KeyError, ValueError, TypeError):
+        raise InputError(f"{path}: expected T_flange_camera (7 numbers) and covariance (6 rows of 6)") from None
+    return Calibration(pose_from_tum(T), cov, tuple(str(words) for words in content.get("unobserved", ())))
