@@ -50,10 +50,10 @@ def cholesky(cov: Array, name: str = "covariance") -> Array:
         A matrix is not positive definite: the message prints the smallest eigenvalue.
     """
     try:
-        lower: Array = np.linalg.cholesky(cov)
+        lower = np.linalg.cholesky(np.asarray(cov, dtype=np.float64))
     except np.linalg.LinAlgError:
         raise CovarianceError(_worst(np.asarray(cov), name)) from None
-    return lower
+    return np.asarray(lower, dtype=np.float64)
 
 
 def forward_substitution(lower: Array, vectors: Array) -> Array:
@@ -105,8 +105,8 @@ def fuse_many(means: Array, covs: Array) -> tuple[Array, Array]:
     """
     identity = np.broadcast_to(np.eye(covs.shape[-1]), covs.shape)
     cholesky(covs)
-    informations: Array = np.linalg.solve(covs, identity)
-    cov: Array = np.linalg.solve(symmetrise(informations.sum(-3)), identity[..., 0, :, :])
+    informations = np.asarray(np.linalg.solve(covs, identity), np.float64)
+    cov = np.asarray(np.linalg.solve(symmetrise(informations.sum(-3)), identity[..., 0, :, :]), np.float64)
     weighted = (informations @ means[..., None]).sum(-3)
     return (cov @ weighted)[..., 0], symmetrise(cov)
 

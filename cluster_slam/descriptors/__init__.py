@@ -4,6 +4,7 @@ from cluster_slam.descriptors.geometry import GeometryMatch, match_geometry
 from cluster_slam.descriptors.members import block_diagonal, checked_points, isotropic
 from cluster_slam.descriptors.moments import (
     closed_form_moments,
+    descriptor_moments,
     inertia_and_mean_distance,
     inertia_beta,
     unscented_moments,
@@ -14,6 +15,7 @@ __all__ = [
     "block_diagonal",
     "checked_points",
     "closed_form_moments",
+    "descriptor_moments",
     "inertia_and_mean_distance",
     "inertia_beta",
     "isotropic",

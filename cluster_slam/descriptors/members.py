@@ -32,6 +32,37 @@ def centred(points: Array) -> Array:
     return out
 
 
+def checked_sigma(sigma: Array | float) -> Array:
+    """Standard deviations as float64, or an error.
+
+    Raises
+    ------
+    InputError
+        Not finite or not positive.
+    """
+    out = np.asarray(sigma, dtype=np.float64)
+    if not (np.isfinite(out) & (out > 0)).all():
+        raise InputError(f"a flower's sigma must be a length > 0, got {out if out.ndim == 0 else out.min()}")
+    return out
+
+
+def centred_cov(cov: Array) -> Array:
+    """Joint covariances (..., 3 n, 3 n) of the offsets from the centroid."""
+    n = cov.shape[-1] // 3
+    blocks = cov.reshape(*cov.shape[:-2], n, 3, n, 3)
+    blocks = blocks - blocks.mean(-4, keepdims=True)
+    blocks = blocks - blocks.mean(-2, keepdims=True)
+    out: Array = blocks.reshape(cov.shape)
+    return out
+
+
+def member_blocks(cov: Array) -> Array:
+    """Each member's own covariances (..., n, 3, 3) out of joint ones (..., 3 n, 3 n)."""
+    n = cov.shape[-1] // 3
+    i = np.arange(n)
+    return np.moveaxis(cov.reshape(*cov.shape[:-2], n, 3, n, 3)[..., i, :, i, :], 0, -3)
+
+
 def isotropic(n: int, sigma: float) -> Array:
     """Joint covariance (3 n, 3 n) of n members with independent errors of `sigma` metres along each axis."""
     return np.eye(3 * n) * float(sigma) ** 2
