@@ -34,7 +34,7 @@ def camera_path(config: SimulateConfig, plant: Plant, times: Array, *, rng: np.r
 def _poses(config: SimulateConfig, plant: Plant, times: Array, phases: Array) -> Array:
     waves = _waves(times, phases)
     low, high = plant.centroids.min(0), plant.centroids.max(0)
-    reach = np.maximum((high - low) / 2, _MARGIN_M * config.scale) * [1.0, 0.3, 0.9]
+    reach = np.maximum((high - low) / 2, _MARGIN_M * config.scale) * [1.15, 0.3, 1.0]
     target = (low + high) / 2 + waves[:, :3] * reach
     azimuth, elevation = config.turn_rad * waves[:, 3], 0.15 + 0.6 * config.turn_rad * waves[:, 4]
     distance = (config.distance_min_m + (0.5 + 0.5 * waves[:, 5]) * _span(config)) * config.scale

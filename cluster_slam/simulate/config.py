@@ -24,12 +24,12 @@ class SimulateConfig:
     flowers_max: int = 6  # flowers of the largest cluster; small ones are commoner
     loose_share: float = 0.04  # of all flowers: single ones, each a cluster of one
     cluster_spacing_m: float = 0.13  # least distance of two centroids
-    neighbour_share: float = 0.5  # of clusters: set within 1.3 spacings of another, as along a real cane
+    neighbour_share: float = 0.4  # of clusters: set within 1.3 spacings of another, as along a real cane
     cluster_radius_min_m: float = 0.02  # flowers lie within this of the centroid in the tightest cluster
     cluster_radius_max_m: float = 0.05  # and within this in the widest
     flower_spacing_m: float = 0.012  # least distance of any two flowers: they are solid
-    plant_width_m: float = 1.4  # along the row
-    plant_height_m: float = 0.9
+    plant_width_m: float = 1.5  # along the row
+    plant_height_m: float = 1.0
     plant_depth_m: float = 0.35  # across the row
     scale: float = 1.0  # times every length of plant, leaves and camera distance
 
@@ -44,7 +44,7 @@ class SimulateConfig:
     image_height_px: int = 480
     focal_px: float = 430.0  # as a D405 or D435 at this size
     depth_min_m: float = 0.1  # nearer flowers are not detected
-    depth_max_m: float = 1.2  # farther flowers are not detected (times scale)
+    depth_max_m: float = 1.0  # farther flowers are not detected (times scale)
 
     # poses
     pose_frame: PoseFrame = "T_world_flange"
@@ -113,7 +113,8 @@ HARD = replace(
     MODERATE,
     n_clusters=40,
     cluster_spacing_m=0.08,
-    plant_width_m=1.2,
+    plant_width_m=1.1,
+    plant_height_m=0.8,
     duration_s=60.0,
     sway_m=0.05,
     touches_per_minute=20.0,
@@ -138,7 +139,7 @@ _STRANGE: dict[str, dict[str, Any]] = {
     "small": {"scale": 0.5},
     "large": {"scale": 3.0},
     "tiny": {"n_clusters": 1, "flowers_min": 3, "flowers_max": 3, "loose_share": 0.0},
-    "huge": {"n_clusters": 300, "cluster_spacing_m": 0.08, "plant_width_m": 3.0},
+    "huge": {"n_clusters": 300, "cluster_spacing_m": 0.08, "plant_width_m": 3.5},
 }
 
 

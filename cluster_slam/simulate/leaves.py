@@ -23,13 +23,17 @@ class Leaves:
 
 
 def grow_leaves(config: SimulateConfig, plant: Plant, times: Array, *, rng: np.random.Generator) -> Leaves:
-    """Leaves 4 to 15 cm in front of clusters (times scale); every second one wanders by up to 8 cm in seconds."""
+    """Leaves 6 to 20 cm in front of clusters (times scale); every second one wanders by up to 8 cm in seconds.
+
+    No cluster has two of its own: leaves beyond the number of clusters hang in front of any stem.
+    """
     k, s = config.n_leaves, config.scale
-    host = plant.centroids[rng.integers(0, 2**31, k) % len(plant.centroids)]
-    place = host + s * rng.uniform([-0.05, -0.15, -0.03], [0.05, -0.04, 0.08], (k, 3))
+    elsewhere = plant.stems.reshape(-1, 3)[rng.integers(0, plant.stems.size // 3, k)]
+    host = np.concatenate([rng.permutation(plant.centroids), elsewhere])[:k]
+    place = host + s * rng.uniform([-0.05, -0.20, -0.03], [0.05, -0.06, 0.08], (k, 3))
     upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # normal along -y, to the arm
     axes = so3_exp(rng.normal(0.0, 0.4, (k, 3))) @ upright
-    radii = s * rng.uniform([0.03, 0.04], [0.06, 0.09], (k, 2))
+    radii = s * rng.uniform([0.04, 0.05], [0.07, 0.1], (k, 2))
     hz, phase = rng.uniform(0.05, 0.2, (k, 1)), rng.uniform(0.0, 2 * np.pi, (k, 3))
     reach = s * rng.uniform(0.03, 0.08, (k, 3)) * (np.arange(k) % 2)[:, None]
     wander = reach * np.sin(2 * np.pi * hz * times[:, None, None] + phase)

@@ -79,11 +79,11 @@ def _touch_times(config: SimulateConfig, rng: np.random.Generator) -> Array:
 
 
 def _oscillators(config: SimulateConfig, plant: Plant, rng: np.random.Generator) -> _Oscillators:
-    """Clusters on one stem have nearly one frequency; no two have the same."""
+    """Clusters on one stem have like frequencies; no two have the same."""
     low, high = config.sway_frequency_min_hz, config.sway_frequency_max_hz
     stem_hz = rng.uniform(low, high, len(plant.stems))
     n = len(plant.centroids)
-    omega_0 = 2 * np.pi * np.clip(stem_hz[plant.stem_ids] * rng.uniform(0.9, 1.1, n), low, high)
+    omega_0 = 2 * np.pi * np.clip(stem_hz[plant.stem_ids] * rng.uniform(0.8, 1.25, n), low, high)
     zeta = rng.uniform(config.damping_min, config.damping_max, n)
     omega = omega_0 * np.sqrt(1 - zeta**2)
     decay = zeta * omega_0
@@ -103,9 +103,9 @@ def _push(config: SimulateConfig, plant: Plant, rng: np.random.Generator) -> Arr
     n = len(plant.centroids)
     place = plant.centroids[rng.integers(n)] + rng.normal(0.0, 0.05 * config.scale, 3)
     away = np.linalg.norm(plant.centroids - place, axis=1) / (config.touch_reach_m * config.scale)
-    size = config.sway_m * rng.uniform(0.5, 1.0) * np.exp(-0.5 * away**2) * rng.uniform(0.8, 1.0, n)
+    size = config.sway_m * rng.uniform(0.5, 1.0) * np.exp(-0.5 * away**2) * rng.uniform(0.6, 1.0, n)
     direction = rng.normal(size=3)
-    direction = direction / np.linalg.norm(direction) + rng.normal(0.0, 0.15, (n, 3))
+    direction = direction / np.linalg.norm(direction) + rng.normal(0.0, 0.2, (n, 3))
     direction -= (1 - _ALONG_STEM) * (direction * plant.tangents).sum(1, keepdims=True) * plant.tangents
     push: Array = size[:, None] * direction / np.linalg.norm(direction, axis=1, keepdims=True)
     return push
@@ -122,7 +122,7 @@ def _turn(plant: Plant, sway: Array) -> Array:
 def _ambient(config: SimulateConfig, n: int, times: Array, rng: np.random.Generator) -> Array:
     """Ornstein-Uhlenbeck process (len(times), n, 3), stationary, sampled exactly."""
     keep = np.exp(-np.diff(times, prepend=times[0] - 1e9) / _AMBIENT_TIME_S)
-    steps = rng.normal(size=(len(times), n, 3)) * (config.ambient_sway_m * np.sqrt(1 - keep**2))[:, None, None]
+    steps: Array = rng.normal(size=(len(times), n, 3)) * (config.ambient_sway_m * np.sqrt(1 - keep**2))[:, None, None]
     for i in range(1, len(times)):
         steps[i] += keep[i] * steps[i - 1]
     return steps

@@ -11,7 +11,7 @@ from cluster_slam.geometry import Array
 from cluster_slam.records import IntArray
 from cluster_slam.simulate.config import SimulateConfig
 
-_N_CANDIDATES = 6000  # places for clusters, of which some are taken
+_N_CANDIDATES = 12000  # places for clusters, of which some are taken
 _CLOSE = 1.3  # neighbours stand within this many spacings
 _STEM_POINTS = 24  # points a stem is drawn with
 
@@ -87,7 +87,7 @@ def _stems(config: SimulateConfig, rng: np.random.Generator) -> Array:
     control = (base + tip) / 2
     control[:, 2] = tip[:, 2] * rng.uniform(0.9, 1.2, n_canes)
     canes = _bezier(base, control, tip)
-    per_cane = 4
+    per_cane = 5
     at = rng.integers(_STEM_POINTS // 3, _STEM_POINTS, (n_canes, per_cane))
     start = np.take_along_axis(canes, at[..., None], axis=1).reshape(-1, 3)
     direction = rng.uniform([-1.0, -0.8, -0.2], [1.0, 0.5, 0.7], (n_canes * per_cane, 3))
