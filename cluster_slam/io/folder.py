@@ -67,7 +67,7 @@ def write_folder(out: Path, files: Mapping[str, str | bytes]) -> None:
     out
         Absent, empty, or a folder that may be replaced (the caller has checked that).
     files
-        Content by name; text becomes UTF-8.
+        Content by name, which may lead into one folder below (``truth/poses.txt``); text becomes UTF-8.
 
     Raises
     ------
@@ -80,6 +80,7 @@ def write_folder(out: Path, files: Mapping[str, str | bytes]) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         new.mkdir()
         for name, content in files.items():
+            (new / name).parent.mkdir(exist_ok=True)
             _write(new / name, content.encode() if isinstance(content, str) else content)
         _sync(new)
         _replace(new, target)

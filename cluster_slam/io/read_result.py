@@ -181,3 +181,15 @@ def _calibration(path: Path) -> Calibration | None:
     except (tomllib.TOMLDecodeError, KeyError, ValueError, TypeError):
         raise InputError(f"{path}: expected T_flange_camera (7 numbers) and covariance (6 rows of 6)") from None
     return Calibration(pose_from_tum(T), cov, tuple(str(words) for words in content.get("unobserved", ())))
+
+
+def read_level(path: str | Path) -> int | None:
+    """The level that the result of a folder was made from; None where it does not say.
+
+    Raises
+    ------
+    InputError
+        No result's ``run.json``.
+    """
+    level = _json(Path(path) / "run.json").get("level")
+    return level if isinstance(level, int) else None

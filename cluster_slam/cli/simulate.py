@@ -1,0 +1,46 @@
+"""``cluster-slam simulate``: a session of a simulated plant, with its truth."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cluster_slam.cli.options import ConfigOption, JsonOption, QuietOption, SeedOption, SetOption, configured
+from cluster_slam.cli.summary import print_json, print_table
+from cluster_slam.errors import ConfigError
+
+
+def command(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Session folder to write.", show_default=False)],
+    preset: Annotated[
+        str,
+        typer.Option("--preset", metavar="NAME", help="moderate, hard, sample, or a strange one as moderate-tails."),
+    ] = "moderate",
+    seed: SeedOption = 0,
+    config: ConfigOption = None,
+    settings: SetOption = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> int:
+    """Write a session of a simulated bramble plant with its ground truth; the same seed gives the same bytes.
+
+    Example: cluster-slam simulate out/session --preset moderate --seed 3 --set sway_m=0.01
+    """
+    from dataclasses import asdict
+
+    from cluster_slam.simulate import PRESETS, simulate
+
+    if preset not in PRESETS:
+        near = difflib.get_close_matches(preset, PRESETS, 1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise ConfigError(f"unknown preset {preset!r}{hint} (known: {', '.join(PRESETS)})")
+    options = configured(PRESETS[preset], config, settings or [])
+    simulate(options, out, seed=seed)
+    if as_json:
+        print_json({"out": str(out), "preset": preset, "seed": seed, "config": asdict(options)})
+    elif not quiet:
+        print_table("cluster-slam simulate", [("preset", preset), ("seed", str(seed)), ("session", str(out))])
+    return 0
