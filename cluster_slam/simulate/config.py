@@ -43,6 +43,7 @@ class SimulateConfig:
     image_width_px: int = 848
     image_height_px: int = 480
     focal_px: float = 430.0  # as a D405 or D435 at this size
+    distortion_k1: float = 0.0  # first radial coefficient: a cheaper lens, -0.05 say
     depth_min_m: float = 0.1  # nearer flowers are not detected
     depth_max_m: float = 1.0  # farther flowers are not detected (times scale)
 

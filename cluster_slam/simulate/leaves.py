@@ -33,7 +33,7 @@ def grow_leaves(config: SimulateConfig, plant: Plant, times: Array, *, rng: np.r
     place = host + s * rng.uniform([-0.05, -0.20, -0.03], [0.05, -0.06, 0.08], (k, 3))
     upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # normal along -y, to the arm
     axes = so3_exp(rng.normal(0.0, 0.4, (k, 3))) @ upright
-    radii = s * rng.uniform([0.04, 0.05], [0.07, 0.1], (k, 2))
+    radii = s * rng.uniform([0.035, 0.045], [0.065, 0.095], (k, 2))
     hz, phase = rng.uniform(0.05, 0.2, (k, 1)), rng.uniform(0.0, 2 * np.pi, (k, 3))
     reach = s * rng.uniform(0.03, 0.08, (k, 3)) * (np.arange(k) % 2)[:, None]
     wander = reach * np.sin(2 * np.pi * hz * times[:, None, None] + phase)

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cluster_slam.geometry import Array, inverse, transform
-from cluster_slam.io.session_writer import Intrinsics
 from cluster_slam.records import CLUTTER, IntArray
+from cluster_slam.sensors.camera import Camera
 from cluster_slam.simulate.config import SimulateConfig
 from cluster_slam.simulate.leaves import Leaves, hidden_by
 
@@ -25,29 +25,37 @@ class Detections:
     pixels: Array  # (m, 3) u, v in pixels and depth in m
 
 
-def intrinsics_of(config: SimulateConfig) -> Intrinsics:
+def camera_of(config: SimulateConfig) -> Camera:
+    """The camera: pixel centres at whole numbers, the optical axis in the middle of the image."""
     width, height = config.image_width_px, config.image_height_px
-    return Intrinsics(config.focal_px, config.focal_px, (width - 1) / 2, (height - 1) / 2, width, height)
+    distortion = np.zeros(8)
+    distortion[0] = config.distortion_k1
+    return Camera(config.focal_px, config.focal_px, (width - 1) / 2, (height - 1) / 2, distortion, width, height)
+
+
+def project(camera: Camera, points: Array) -> Array:
+    """u, v (px) and depth (m) (m, 3) of points (m, 3) in the camera frame."""
+    return np.column_stack([camera.project(points), points[:, 2]])
 
 
 def in_view(config: SimulateConfig, points: Array) -> BoolArray:
-    """Which points (..., 3) of the camera frame lie in the image and within the depth range."""
-    camera = intrinsics_of(config)
-    deep = (points[..., 2] > config.depth_min_m) & (points[..., 2] < config.depth_max_m * config.scale)
-    pixels = camera.project(np.where(deep[..., None], points, [0.0, 0.0, 1.0]))
-    inside: BoolArray = (
-        deep
-        & (pixels[..., 0] >= 0)
-        & (pixels[..., 0] <= camera.width - 1)
-        & (pixels[..., 1] >= 0)
-        & (pixels[..., 1] <= camera.height - 1)
-    )
+    """Which points (m, 3) of the camera frame lie in the image and within the depth range."""
+    inside = (points[:, 2] > config.depth_min_m) & (points[:, 2] < config.depth_max_m * config.scale)
+    inside[inside] = in_image(config, camera_of(config).project(points[inside]))
+    return inside
+
+
+def in_image(config: SimulateConfig, pixels: Array) -> BoolArray:
+    """Which pixels (m, 2 or more) lie in the image."""
+    u, v = pixels[:, 0], pixels[:, 1]
+    inside: BoolArray = (u >= 0) & (u <= config.image_width_px - 1) & (v >= 0) & (v <= config.image_height_px - 1)
     return inside
 
 
 def visible_flowers(config: SimulateConfig, T_world_camera: Array, flowers: Array, leaves: Leaves) -> BoolArray:
     """Which flowers (n, f) are in view and not behind a leaf."""
-    visible = in_view(config, transform(inverse(T_world_camera)[:, None], flowers))
+    points = transform(inverse(T_world_camera)[:, None], flowers)
+    visible = in_view(config, points.reshape(-1, 3)).reshape(flowers.shape[:2])
     frame, flower = np.nonzero(visible)
     hidden = hidden_by(leaves, frame, T_world_camera[frame, :3, 3], flowers[frame, flower])
     visible[frame[hidden], flower[hidden]] = False
@@ -68,10 +76,10 @@ def detect(
     seen = visible & (miss_rng.random(visible.shape) >= config.miss_rate)
     frame, flower = np.nonzero(seen)
     points = transform(inverse(T_world_camera)[frame], flowers[frame, flower])
-    camera = intrinsics_of(config)
-    pixels = camera.project(points)
+    pixels = project(camera_of(config), points)
     pixels += _errors(config, seen, pixels[:, 2], noise_rng)
-    pixels[:, 2] = np.maximum(pixels[:, 2], 0.02)
+    good = in_image(config, pixels) & (pixels[:, 2] > config.depth_min_m / 2)
+    frame, flower, pixels = frame[good], flower[good], pixels[good]
     false_frame, false_pixels = _clutter(config, T_world_camera, flowers, visible, leaves, clutter_rng)
     frame = np.concatenate([frame, false_frame])
     order = np.lexsort([order_rng.random(len(frame)), frame])
@@ -136,7 +144,7 @@ def _near(
     points = transform(inverse(T_world_camera)[frame], points)
     good = in_view(config, points) & visible[frame, flower]
     pixels = fallback.copy()
-    pixels[good] = intrinsics_of(config).project(points[good])
+    pixels[good] = project(camera_of(config), points[good])
     return pixels
 
 
@@ -157,6 +165,8 @@ def _staying(
     points = hosts[frame, which % hosts.shape[1]] + offset
     points = transform(inverse(T_world_camera)[frame], points)
     good = in_view(config, points)
-    pixels = intrinsics_of(config).project(points[good])
+    pixels = project(camera_of(config), points[good])
     sigma = np.stack([np.full(len(pixels), config.pixel_sigma)] * 2 + [config.depth_sigma * pixels[:, 2] ** 2], axis=1)
-    return frame[good], pixels + noise[good] * sigma
+    pixels = pixels + noise[good] * sigma
+    inside = in_image(config, pixels)
+    return frame[good][inside], pixels[inside]

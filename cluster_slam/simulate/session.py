@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cluster_slam.geometry import Array
-from cluster_slam.io.session_writer import Intrinsics, write_session
+from cluster_slam.io.session_writer import Moments, check_session_output, write_session
+from cluster_slam.lift import lift
 from cluster_slam.records import CLUTTER, Observations, Session, StatedNoise, Truth
+from cluster_slam.sensors.camera import Camera
 from cluster_slam.simulate.camera_path import HandEye, camera_path, measured_poses, mount_camera
 from cluster_slam.simulate.config import SimulateConfig
 from cluster_slam.simulate.leaves import grow_leaves
 from cluster_slam.simulate.motion import Motion, flower_positions, move
 from cluster_slam.simulate.plant import Plant, grow_plant
-from cluster_slam.simulate.sensor import Detections, detect, intrinsics_of, visible_flowers
+from cluster_slam.simulate.sensor import Detections, camera_of, detect, visible_flowers
 
 _START_S = 1_777_888_800.0  # 2026-05-04 10:00 UTC
 
@@ -33,7 +35,7 @@ class Simulated:
     plant: Plant
     motion: Motion
     hand_eye: HandEye
-    intrinsics: Intrinsics
+    camera: Camera
 
 
 def simulate(config: SimulateConfig, out: Path, *, seed: int) -> None:
@@ -46,16 +48,11 @@ def simulate(config: SimulateConfig, out: Path, *, seed: int) -> None:
     OutputError
         ``out`` holds something that is no earlier session, or cannot be written.
     """
+    check_session_output(out)
     made = simulate_session(config, seed=seed)
     frames = np.unique(np.linspace(0, made.session.n_frames - 1, 10).round().astype(np.int64))
-    write_session(
-        out,
-        made.session,
-        made.truth,
-        intrinsics=made.intrinsics,
-        timed_frames=frames,
-        timed_positions=made.flower_positions[frames],
-    )
+    moments = Moments(frames, made.flower_positions[frames])
+    write_session(out, made.session, made.truth, camera=made.camera, moments=moments)
 
 
 def simulate_session(config: SimulateConfig, *, seed: int) -> Simulated:
@@ -83,7 +80,7 @@ def simulate_session(config: SimulateConfig, *, seed: int) -> Simulated:
         level=config.level,
     )
     truth = _truth(plant, T_world_camera, detections)
-    return Simulated(config, session, truth, flowers, visible, plant, motion, hand_eye, intrinsics_of(config))
+    return Simulated(config, session, truth, flowers, visible, plant, motion, hand_eye, camera_of(config))
 
 
 def _rng(seed: int, part: str) -> np.random.Generator:
@@ -109,10 +106,11 @@ def _observe(
 ) -> tuple[Observations, StatedNoise]:
     """Camera-frame points with the covariances that are stated, and the session's stated noise."""
     pixels = detections.pixels
-    camera = intrinsics_of(config)
     factor = config.stated_sigma_factor
     pixel, depth = factor * max(config.pixel_sigma, 0.01), factor * max(config.depth_sigma, 1e-5)
-    covs = camera.point_covs(pixels, pixel, depth)
+    points, covs = lift(
+        camera_of(config), pixels[:, :2], pixels[:, 2], convention="z", sigma_px=pixel, depth_coefficient=depth
+    )
     flower = float(np.sqrt(covs.trace(axis1=1, axis2=2).mean() / 3)) if len(covs) else 0.005 * factor
     has_covariance = config.with_covariances or config.level == 2
     if not has_covariance:
@@ -131,4 +129,4 @@ def _observe(
         pixel=pixel,
         depth=depth,
     )
-    return Observations(detections.frame, camera.lift(pixels), covs, scores, has_covariance), noise
+    return Observations(detections.frame, points, covs, scores, has_covariance), noise
