@@ -1,0 +1,138 @@
+"""What went wrong, or may have: judged from the result itself, in words for somebody who did not make it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from cluster_slam.evaluation import Metrics
+from cluster_slam.records import Result
+from cluster_slam.report.statistics import Summary
+from cluster_slam.report.words import count, digits, length, share
+from tracking.consistency import mean_band
+
+Level = Literal["bad", "warn", "note"]
+
+_MUCH_REJECTED = 0.3  # share of detections, above which the detector or the result deserves a look
+_NOISE_FACTOR = 1.25  # an estimated sigma further than this from the stated one is worth a word
+_MISFIT_SLACK = 0.2  # how far the mean misfit may be from 1 before it matters in practice
+_LOOSE_FACTOR = 5.0  # a cluster this much less certain than the typical one is named
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing to know, in one or two sentences."""
+
+    level: Level
+    text: str
+
+
+def find(result: Result, summary: Summary, metrics: Metrics | None) -> tuple[Finding, ...]:
+    """All that is worth a warning, worst first."""
+    parts = (_status(result, summary), _rejection(summary), _consistency(result, summary), _certainty(result, summary))
+    found = [finding for part in parts for finding in part]
+    found += list(_calibration(result)) + list(_noise(result)) + list(_against_truth(metrics))
+    known = {finding.text for finding in found}
+    found += [Finding("warn", text) for text in (*result.session.warnings, *result.warnings) if text not in known]
+    order: list[Level] = ["bad", "warn", "note"]
+    return tuple(sorted(found, key=lambda finding: order.index(finding.level)))
+
+
+def _status(result: Result, summary: Summary) -> Iterator[Finding]:
+    if result.status == "poor":
+        yield Finding("bad", "The program itself calls this result poor: do not rely on it before the causes below.")
+    if summary.n_flowers == 0:
+        yield Finding("bad", "No flower was confirmed, so there is no map.")
+    if summary.n_unsure:
+        yield Finding("warn", f"{count(summary.n_unsure, 'cluster')} could not be confirmed and may not exist.")
+    for older, newer in result.merged[:5]:
+        yield Finding("note", f"Cluster {older} and cluster {newer} turned out to be the same and were merged.")
+
+
+def _rejection(summary: Summary) -> Iterator[Finding]:
+    if summary.n_observations and summary.n_rejected > _MUCH_REJECTED * summary.n_observations:
+        part = share(summary.n_rejected, summary.n_observations)
+        yield Finding("warn", f"{part} of all detections were rejected. Either the detector sees much that is not there"
+                      ", or flowers were missed by the map.")  # fmt: skip
+
+
+def _consistency(result: Result, summary: Summary) -> Iterator[Finding]:
+    if summary.misfit is None:
+        return
+    n = int(np.isfinite(result.diagnostics.nis).sum())
+    band = mean_band(3, n)
+    if band.low / 3 <= summary.misfit <= band.high / 3 or abs(summary.misfit - 1.0) <= _MISFIT_SLACK:
+        return
+    level: Level = "bad" if summary.misfit > 2.0 else "warn"
+    if summary.misfit > 1.0:
+        times = digits(float(np.sqrt(summary.misfit)))
+        yield Finding(level, f"Detections scatter {times} times as much as the program accounts for: "
+                      "the stated certainty is too good.")  # fmt: skip
+    else:
+        times = digits(float(1.0 / np.sqrt(summary.misfit)))
+        yield Finding("note", f"Detections scatter {times} times less than the program accounts for: "
+                      "the map is better than it says.")  # fmt: skip
+
+
+def _certainty(result: Result, summary: Summary) -> Iterator[Finding]:
+    worst, typical = summary.worst_radius95_m, summary.radius95_m
+    if worst is None or typical is None or worst <= _LOOSE_FACTOR * typical:
+        return
+    row = int(np.searchsorted(result.clusters.ids, summary.worst_cluster or 0))
+    seen = count(int(result.clusters.n_observations[row]), "time")
+    yield Finding("warn", f"Cluster {summary.worst_cluster} is known to {length(worst)} only, "
+                  f"against {length(typical)} for a typical one; it was seen {seen}.")  # fmt: skip
+
+
+def _calibration(result: Result) -> Iterator[Finding]:
+    if result.calibration is not None and result.calibration.unobserved:
+        directions = ", ".join(result.calibration.unobserved)
+        yield Finding("warn", f"The motion of the camera does not determine where it sits on the robot ({directions}): "
+                      "there the value of the session was kept.")  # fmt: skip
+
+
+def _noise(result: Result) -> Iterator[Finding]:
+    stated = result.session.noise
+    for name, value in sorted(result.diagnostics.estimated_noise.items()):
+        claim = getattr(stated, name, None)
+        if not claim or not value > 0:
+            continue
+        ratio = value / claim
+        if max(ratio, 1 / ratio) > _NOISE_FACTOR:
+            than = f"{digits(ratio)} times" if ratio > 1 else f"only {digits(100 * ratio)} % of"
+            yield Finding("note", f"The errors of {NOISE_WORDS.get(name, name)} are {than} what the session states.")
+
+
+NOISE_WORDS = {
+    "pose_translation": "the robot's position",
+    "pose_rotation": "the robot's orientation",
+    "odometry_translation": "the distance travelled",
+    "odometry_rotation": "the angle turned",
+    "hand_eye_translation": "the camera's place on the robot",
+    "hand_eye_rotation": "the camera's orientation on the robot",
+    "flower": "a flower's position in one picture",
+    "pixel": "a flower's place in the picture",
+    "depth": "the measured depth",
+    "sway": "the plant's sway",
+}
+
+
+def _against_truth(metrics: Metrics | None) -> Iterator[Finding]:
+    if metrics is None:
+        return
+    if metrics.n_ghost_clusters:
+        yield Finding("bad", f"{count(metrics.n_ghost_clusters, 'cluster')} of the map do not exist in truth, "
+                      "or are there twice.")  # fmt: skip
+    if metrics.n_clusters_true and metrics.n_clusters_found is not None:
+        missed = metrics.n_clusters_true - metrics.n_clusters_found
+        if missed > 0:
+            yield Finding("bad", f"{missed} of {count(metrics.n_clusters_true, 'true cluster')} were not found.")
+    if metrics.cluster_idf1 is not None and metrics.cluster_idf1 < 0.99:
+        wrong = digits(100 * (1 - metrics.cluster_idf1))
+        yield Finding("bad", f"About {wrong} % of detections carry the wrong cluster, by the truth of the session.")
+    if metrics.nees_flowers is not None and metrics.nees_flowers > 2.0:
+        times = digits(float(np.sqrt(metrics.nees_flowers)))
+        yield Finding("bad", f"Flowers are {times} times further from the truth than the map claims.")
