@@ -15,9 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaincinv
 
 from tracking.errors import ParameterError
-from tracking.gaussian import Array, cholesky, ensure_positive_semidefinite, forward_substitution
-
-LOG_2PI = float(np.log(2.0 * np.pi))
+from tracking.gaussian import LOG_2PI, Array, cholesky, ensure_positive_semidefinite, forward_substitution
 
 
 class GateReason(IntEnum):

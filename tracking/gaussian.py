@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from tracking.errors import CovarianceError
 
 Array = NDArray[np.float64]
+LOG_2PI = float(np.log(2.0 * np.pi))
 ASYMMETRY = 1e-8  # largest |C - C'| that counts as rounding, relative to the largest entry
 
 

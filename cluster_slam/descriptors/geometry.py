@@ -1,58 +1,203 @@
-"""The full-geometry test: best one-to-one matching of members and best rigid motion, chi-square with 3 n - 6."""
+"""The full-geometry test: are two clusters one shape, wherever and however they stand, whichever member is which?
+
+The best one-to-one map of the members and the best rigid motion leave a residual that is chi-square with 3 k - 6
+degrees of freedom, k the number of matched members. Members may be missing on either side.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
-from itertools import permutations
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cluster_slam.descriptors.members import checked_points
-from cluster_slam.geometry import Array, kabsch, transform
+from cluster_slam.descriptors.alignment import Aligned, align, align_isotropic
+from cluster_slam.descriptors.members import centred_cov, checked_points, checked_sigma
+from cluster_slam.descriptors.search import MISSED, Maps, search_maps
+from cluster_slam.errors import InputError
+from cluster_slam.geometry import Array, inverse
 from cluster_slam.records import IntArray
-from tracking.gating import mahalanobis_sq
+from tracking.gating import chi2_threshold
+from tracking.gaussian import ensure_positive_definite
+
+FIRST_LIMIT = 0.999  # the search begins within this gate and widens while it finds nothing
+WIDER = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GeometryMatch:
-    """The best matching of two clusters' members."""
+    """The best map of one cluster's members onto another's."""
 
-    distance_sq: float  # squared Mahalanobis distance of the residuals
-    dof: int  # 3 k - 6
-    reference: IntArray  # (k,) matched members of the reference
+    distance_sq: float  # squared Mahalanobis distance of the residuals; inf where none is within the limit
+    dof: int  # 3 k - 6; more where the shape leaves a rotation undetermined; 0 where there is no match
+    log_likelihood: float  # of the matched members, integrated over the pose (`Aligned`)
+    reference: IntArray  # (k,) matched members of the reference, increasing
     observed: IntArray  # (k,) their partners
     T_observed_reference: Array  # (4, 4) takes reference points onto observed ones
+    runner_up_sq: float  # no other map found within the limit costs less; inf where there is no other
 
 
-def match_geometry(reference: Array, observed: Array, covs: Array) -> GeometryMatch:
-    """Match points (n, 3) with points (m, 3), n, m >= 3: all of the smaller set are matched.
+@dataclass(frozen=True, slots=True, eq=False)
+class GeometryMatches:
+    """The same for p pairs of clusters; as `GeometryMatch`, without the maps."""
 
-    `covs` (3, 3): covariance of a residual.
+    distance_sq: Array  # (p,)
+    dof: Array  # (p,) NaN where there is no match
+    log_likelihood: Array  # (p,)
+    runner_up_sq: Array  # (p,)
+
+
+NO_MATCH = GeometryMatch(np.inf, 0, -np.inf, np.zeros(0, np.int64), np.zeros(0, np.int64), np.eye(4), np.inf)
+
+
+def match_geometry(
+    reference: Array,
+    reference_cov: Array,
+    observed: Array,
+    observed_cov: Array,
+    *,
+    missed_cost: float = np.inf,
+    limit: float | None = None,
+) -> GeometryMatch:
+    """Match members (n, 3) with members (m, 3), each with a joint covariance.
+
+    Parameters
+    ----------
+    reference, observed
+        (n, 3) and (m, 3), n, m >= 2, each in its own frame, m.
+    reference_cov, observed_cov
+        Joint covariances (3 n, 3 n) and (3 m, 3 m) in the same frames, m^2.
+    missed_cost
+        Price of each member that stays alone, in units of the squared distance. Infinite: the smaller cluster is
+        matched whole.
+    limit
+        Costs above it count as no match, which is much faster. None: the best map is found however bad.
+
+    Raises
+    ------
+    InputError
+        Fewer than two flowers, a position that is not finite, or covariances of the wrong shape.
+    CovarianceError
+        The covariance of the residuals is not positive definite.
     """
-    a, b = checked_points(reference, 3), checked_points(observed, 3)
-    swapped = len(a) > len(b)
-    few, many = (b, a) if swapped else (a, b)
-    choices = _injections(len(few), len(many))
-    best = choices[int(np.argmin(_residuals(few, many[choices])))]
-    own = np.arange(len(few), dtype=np.int64)
-    i, j = (best, own) if swapped else (own, best)
-    T = kabsch(a[i], b[j])
-    residual = b[j] - transform(T, a[i])
-    return GeometryMatch(float(mahalanobis_sq(residual, covs).sum()), 3 * len(i) - 6, i, j, T)
+    a, b = checked_points(reference), checked_points(observed)
+    cov_a, cov_b = _checked_cov(reference_cov, len(a)), _checked_cov(observed_cov, len(b))
+    if not missed_cost > 0:
+        raise InputError(f"missed_cost must be > 0, got {missed_cost}")
+    if len(a) > len(b) and not np.isfinite(missed_cost):
+        return _turned(match_geometry(b, cov_b, a, cov_a, missed_cost=missed_cost, limit=limit))
+    var, alone = _largest_var(cov_a) + _largest_var(cov_b), (len(a) + len(b)) * missed_cost
+    current = min(alone, _first_limit(len(a), len(b), missed_cost) if limit is None else limit)
+    while True:
+        maps = search_maps(a[None], b[None], np.array([var]), np.array([current]), missed_cost)
+        best = _best(maps, a, cov_a, b, cov_b, missed_cost, current)
+        if limit is not None or np.isfinite(best.distance_sq) or current >= alone or not np.isfinite(current):
+            return best
+        current = min(alone, current * WIDER)
 
 
-@lru_cache(maxsize=32)
-def _injections(k: int, n: int) -> IntArray:
-    return np.array(list(permutations(range(n), k)), dtype=np.int64)
+def match_geometries(
+    reference: Array, observed: Array, sigma: Array | float, limit: Array | float = np.inf
+) -> GeometryMatches:
+    """Match many pairs of clusters at once, members with equal isotropic errors; the smaller is matched whole.
 
-
-def _residuals(a: Array, b: Array) -> Array:
-    """Least squares residuals (...) of rigid alignment of a (k, 3) with b (..., k, 3)."""
-    a = a - a.mean(0)
-    b = b - b.mean(-2, keepdims=True)
-    H = a.T @ b
-    s = np.linalg.svd(H, compute_uv=False)
-    sign = np.where(np.linalg.det(H) < 0, -1.0, 1.0)
-    out: Array = (a * a).sum() + (b * b).sum((-1, -2)) - 2.0 * (s[..., 0] + s[..., 1] + sign * s[..., 2])
+    Parameters
+    ----------
+    reference, observed
+        (p, n, 3) and (p, m, 3), m.
+    sigma
+        (p,) or one number: standard deviation of a residual along each axis, hypot of both sides' sigmas, m.
+    limit
+        (p,) or one number: squared distances above it are not looked for. Infinite: every map is weighed.
+    """
+    a, b = checked_points(reference), checked_points(observed)
+    if a.shape[1] > b.shape[1]:
+        turned = match_geometries(b, a, sigma, limit)
+        return GeometryMatches(turned.distance_sq, turned.dof, turned.log_likelihood, turned.runner_up_sq)
+    var = np.broadcast_to(checked_sigma(sigma) ** 2, len(a))
+    maps = search_maps(a, b, var, np.broadcast_to(np.asarray(limit, float), len(a)))
+    pair, first = np.unique(maps.pair, return_index=True)
+    best = maps.partner[first]
+    aligned = align_isotropic(a[pair], np.take_along_axis(b[pair], best[..., None], axis=1), var[pair])
+    out = GeometryMatches(*(np.full(len(a), v) for v in (np.inf, np.nan, -np.inf, np.inf)))
+    out.distance_sq[pair], out.dof[pair], out.log_likelihood[pair] = (
+        aligned.distance_sq,
+        aligned.dof,
+        aligned.log_likelihood,
+    )
+    second = np.minimum(first + 1, len(maps.pair) - 1)
+    has_second = maps.pair[second] == pair
+    out.runner_up_sq[pair[has_second & (second > first)]] = maps.bound[second[has_second & (second > first)]]
     return out
+
+
+def _best(
+    maps: Maps, a: Array, cov_a: Array, b: Array, cov_b: Array, missed_cost: float, limit: float
+) -> GeometryMatch:
+    """Align the maps by increasing bound until no bound is left below the best cost."""
+    var = _common_var(cov_a, cov_b)
+    price = missed_cost if np.isfinite(missed_cost) else 0.0
+    best, best_cost, next_cost = None, np.inf, np.inf
+    for row, bound in zip(maps.partner, maps.bound, strict=True):
+        if bound > best_cost:
+            next_cost = min(next_cost, float(bound))
+            break
+        i = np.flatnonzero(row != MISSED)
+        if len(i) < 2:
+            continue
+        aligned = _aligned(a, cov_a, b, cov_b, i, row[i], var)
+        cost = float(aligned.distance_sq) + price * (len(a) + len(b) - 2 * len(i))
+        if cost < best_cost:
+            best, best_cost, next_cost = (aligned, i, row[i]), cost, best_cost
+        else:
+            next_cost = min(next_cost, cost)
+    if best is None or best_cost > limit:
+        return NO_MATCH
+    aligned, i, j = best
+    log_likelihood, dof = float(aligned.log_likelihood), int(aligned.dof)
+    return GeometryMatch(float(aligned.distance_sq), dof, log_likelihood, i, j, aligned.T, next_cost)
+
+
+def _aligned(a: Array, cov_a: Array, b: Array, cov_b: Array, i: IntArray, j: IntArray, var: float | None) -> Aligned:
+    if var is not None:
+        return align_isotropic(a[i], b[j], np.asarray(var))
+    return align(a[i], _of_members(cov_a, i), b[j], _of_members(cov_b, j))
+
+
+def _of_members(cov: Array, members: IntArray) -> Array:
+    index = (3 * members[:, None] + np.arange(3)).ravel()
+    out: Array = cov[np.ix_(index, index)]
+    return out
+
+
+def _common_var(cov_a: Array, cov_b: Array) -> float | None:
+    """The variance of every residual where all are equal, isotropic and independent; else None."""
+    total = 0.0
+    for cov in (cov_a, cov_b):
+        var = float(cov[0, 0])
+        if np.abs(cov - var * np.eye(len(cov))).max() > 1e-12 * abs(var):
+            return None
+        total += var
+    return total
+
+
+def _largest_var(cov: Array) -> float:
+    """Largest variance of the members relative to their centroid: an error that all share moves no shape."""
+    return float(np.linalg.eigvalsh(centred_cov(cov))[-1])
+
+
+def _first_limit(n: int, m: int, missed_cost: float) -> float:
+    forced = abs(n - m) * missed_cost if np.isfinite(missed_cost) else 0.0
+    return chi2_threshold(max(3 * min(n, m) - 6, 1), FIRST_LIMIT) + forced
+
+
+def _checked_cov(cov: Array, n: int) -> Array:
+    cov = np.asarray(cov, float)
+    if cov.shape != (3 * n, 3 * n):
+        raise InputError(f"{n} flowers want a joint covariance ({3 * n}, {3 * n}), got {cov.shape}")
+    return ensure_positive_definite(cov, "covariance of the members")
+
+
+def _turned(match: GeometryMatch) -> GeometryMatch:
+    order = np.argsort(match.observed)
+    T = inverse(match.T_observed_reference)
+    return replace(match, reference=match.observed[order], observed=match.reference[order], T_observed_reference=T)

@@ -110,8 +110,8 @@ def descriptor_moments(points: Array, cov: Array) -> tuple[Array, Array]:
 def closed_form_moments(points: Array, sigma: Array | float) -> tuple[Array, Array]:
     """Mean (..., 2) and covariance (..., 2, 2) of inertia and mean distance, all members with isotropic errors `sigma`.
 
-    As `descriptor_moments`, in closed form and in time proportional to n. The series for two members' distances makes a relative
-    error of var(D) below 2e-5 where the radius exceeds 5 sigma, 3e-3 at 1 sigma.
+    As `descriptor_moments`, in closed form and in time proportional to n. The series for two distances makes a
+    relative error of var(D) below 2e-5 where the radius exceeds 5 sigma, 3e-3 at 1 sigma.
 
     Parameters
     ----------
