@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from math import pi
+from dataclasses import dataclass, fields, replace
+from math import inf, pi
 from typing import Any
 
 from cluster_slam.errors import ConfigError
@@ -25,8 +25,8 @@ class SimulateConfig:
     loose_share: float = 0.04  # of all flowers: single ones, each a cluster of one
     cluster_spacing_m: float = 0.13  # least distance of two centroids
     neighbour_share: float = 0.4  # of clusters: set within 1.3 spacings of another, as along a real cane
-    cluster_radius_min_m: float = 0.02  # flowers lie within this of the centroid in the tightest cluster
-    cluster_radius_max_m: float = 0.05  # and within this in the widest
+    cluster_radius_min_m: float = 0.02  # the farthest flower of the tightest cluster from its centroid
+    cluster_radius_max_m: float = 0.05  # and of the widest
     flower_spacing_m: float = 0.012  # least distance of any two flowers: they are solid
     plant_width_m: float = 1.5  # along the row
     plant_height_m: float = 1.0
@@ -43,7 +43,7 @@ class SimulateConfig:
     image_width_px: int = 848
     image_height_px: int = 480
     focal_px: float = 430.0  # as a D405 or D435 at this size
-    distortion_k1: float = 0.0  # first radial coefficient: a cheaper lens, -0.05 say
+    distortion_k1: float = 0.0  # first radial coefficient, of pincushion kind; it matters at level 2 only
     depth_min_m: float = 0.1  # nearer flowers are not detected
     depth_max_m: float = 1.0  # farther flowers are not detected (times scale)
 
@@ -84,29 +84,46 @@ class SimulateConfig:
     growth_m_per_s: float = 0.0  # slow drift of each cluster from its place at the start
 
     def __post_init__(self) -> None:
-        for name in ("scale", "duration_s", "fps", "focal_px", "max_speed_m_per_s", "stated_sigma_factor"):
-            if not getattr(self, name) > 0.0:
+        for name in (f.name for f in fields(self)):
+            value = getattr(self, name)
+            if not isinstance(value, str) and not 0 <= value < inf:
+                raise ConfigError(f"{name} must be a number from 0, not {value}")
+        for name in _POSITIVE:
+            if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be greater than 0, not {getattr(self, name)}")
-        for name in ("loose_share", "neighbour_share", "tail_share", "miss_rate", "clutter_persistent_share"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
+        for name in _SHARES:
+            if getattr(self, name) > 1:
                 raise ConfigError(f"{name} must lie within 0 and 1, not {getattr(self, name)}")
         for low, high in _RANGES:
-            if not 0 <= getattr(self, low) <= getattr(self, high):
-                raise ConfigError(f"{low} = {getattr(self, low)} must lie within 0 and {high} = {getattr(self, high)}")
-        if self.level not in (2, 3):
-            raise ConfigError(f"level must be 2 or 3, not {self.level}")
+            if getattr(self, low) > getattr(self, high):
+                raise ConfigError(f"{low} = {getattr(self, low)} must not exceed {high} = {getattr(self, high)}")
+        for name, allowed in _CHOICES:
+            if getattr(self, name) not in allowed:
+                raise ConfigError(f"{name} must be one of {allowed}, not {getattr(self, name)!r}")
 
     @property
     def n_frames(self) -> int:
         return max(1, round(self.duration_s * self.fps))
 
 
+_POSITIVE = (
+    *("n_clusters", "flowers_min", "scale", "plant_width_m", "plant_height_m", "touch_reach_m"),
+    *("duration_s", "fps", "distance_min_m", "max_speed_m_per_s", "focal_px", "image_width_px", "image_height_px"),
+    *("sway_frequency_min_hz", "stated_sigma_factor"),
+)
+_SHARES = ("neighbour_share", "tail_share", "miss_rate", "clutter_persistent_share", "damping_max", "loose_share")
 _RANGES = (
     ("flowers_min", "flowers_max"),
     ("cluster_radius_min_m", "cluster_radius_max_m"),
     ("distance_min_m", "distance_max_m"),
+    ("depth_min_m", "depth_max_m"),
     ("sway_frequency_min_hz", "sway_frequency_max_hz"),
     ("damping_min", "damping_max"),
+)
+_CHOICES: tuple[tuple[str, tuple[str | int, ...]], ...] = (
+    ("pose_frame", ("T_world_flange", "T_world_camera")),
+    ("pose_error", ("absolute", "odometry")),
+    ("level", (2, 3)),
 )
 
 MODERATE = SimulateConfig()
@@ -114,6 +131,7 @@ HARD = replace(
     MODERATE,
     n_clusters=40,
     cluster_spacing_m=0.08,
+    cluster_radius_max_m=0.045,
     plant_width_m=1.1,
     plant_height_m=0.8,
     duration_s=60.0,
@@ -140,6 +158,15 @@ _STRANGE: dict[str, dict[str, Any]] = {
     "small": {"scale": 0.5},
     "large": {"scale": 3.0},
     "tiny": {"n_clusters": 1, "flowers_min": 3, "flowers_max": 3, "loose_share": 0.0},
+    "odometry": {
+        **{"pose_error": "odometry", "pose_frame": "T_world_camera"},
+        **{"pose_translation": 0.0005, "pose_rotation": 0.0005},
+    },
+    "pixels": {"level": 2},
+    "bare": {"with_covariances": False},
+    "translation": {"turn_rad": 0.0},
+    "long": {"duration_s": 5000 / 30},
+    "longest": {"duration_s": 20000 / 30},
     "huge": {"n_clusters": 300, "cluster_spacing_m": 0.08, "plant_width_m": 3.5},
 }
 

@@ -139,28 +139,33 @@ def _choose(places: Array, n: int, config: SimulateConfig, rng: np.random.Genera
 
 def _flowers(centroids: Array, counts: IntArray, config: SimulateConfig, rng: np.random.Generator) -> Array:
     """Flowers about each centroid, their mean exactly there, none nearer than the flower spacing to any other."""
-    placed: list[Array] = []
     radii = rng.uniform(config.cluster_radius_min_m, config.cluster_radius_max_m, len(counts))
+    solid = centroids[counts == 1]  # single flowers stand where they must; the others give way
+    placed: list[Array] = []
     for centroid, count, radius in zip(centroids, counts, radii, strict=True):
-        others = np.concatenate(placed) if placed else np.empty((0, 3))
-        others = others[np.linalg.norm(others - centroid, axis=1) < 0.2]
-        placed.append(centroid + _offsets(centroid - others, int(count), float(radius), config.flower_spacing_m, rng))
+        if count == 1:
+            placed.append(centroid[None])
+            continue
+        near = solid[np.linalg.norm(solid - centroid, axis=1) < 0.2]
+        flowers = centroid + _offsets(near - centroid, int(count), float(radius), config.flower_spacing_m, rng)
+        placed.append(flowers)
+        solid = np.concatenate([solid, flowers])
     return np.concatenate(placed)
 
 
-def _offsets(free: Array, count: int, radius: float, spacing: float, rng: np.random.Generator) -> Array:
-    """Offsets (count, 3) with mean zero, within the radius, apart from each other and from others at ``-free``."""
+def _offsets(others: Array, count: int, radius: float, spacing: float, rng: np.random.Generator) -> Array:
+    """Offsets (count, 3) with mean zero, the farthest at the radius, apart from each other and from others (k, 3)."""
     for _ in range(500):
-        if count == 1:
-            offsets = np.zeros((1, 3))
-        else:
-            draws = rng.normal(size=(8 * count, 3))
-            draws *= radius * np.cbrt(rng.random((8 * count, 1))) / np.linalg.norm(draws, axis=1, keepdims=True)
-            offsets = _apart(draws, count, spacing)
-            offsets = offsets - offsets.mean(0)
-        clear = np.linalg.norm(offsets[:, None] + free[None], axis=2) >= spacing
-        if len(offsets) == count and clear.all() and np.linalg.norm(offsets, axis=1).max() <= radius:
-            return offsets
+        draws = rng.normal(size=(8 * count, 3))
+        draws *= radius * np.cbrt(rng.random((8 * count, 1))) / np.linalg.norm(draws, axis=1, keepdims=True)
+        kept = _apart(draws, count, spacing)
+        offsets = kept - kept.mean(0)
+        growth = radius / max(np.linalg.norm(offsets, axis=1).max(), 1e-9)
+        if len(kept) < count or growth < 1.0:
+            continue
+        grown: Array = growth * offsets
+        if (np.linalg.norm(grown[:, None] - others, axis=2) >= spacing).all():
+            return grown
     raise ConfigError(f"{count} flowers do not fit within {radius:.3f} m at flower_spacing_m = {spacing}")
 
 

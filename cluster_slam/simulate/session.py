@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from cluster_slam.errors import ConfigError
 from cluster_slam.geometry import Array
 from cluster_slam.io.session_writer import Moments, check_session_output, write_session
 from cluster_slam.lift import lift
@@ -56,7 +57,15 @@ def simulate(config: SimulateConfig, out: Path, *, seed: int) -> None:
 
 
 def simulate_session(config: SimulateConfig, *, seed: int) -> Simulated:
-    """Simulate a recording in memory. The same configuration and seed give the same arrays in any process."""
+    """Simulate a recording in memory. The same configuration and seed give the same arrays in any process.
+
+    Raises
+    ------
+    ConfigError
+        The plant does not fit its own spacings, or the seed is negative.
+    """
+    if seed < 0:
+        raise ConfigError(f"the seed must be a whole number from 0, not {seed}")
     times = np.arange(config.n_frames) / config.fps
     plant = grow_plant(config, rng=_rng(seed, "plant"))
     motion = move(config, plant, times, rng=_rng(seed, "motion"))
