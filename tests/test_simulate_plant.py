@@ -99,8 +99,15 @@ def _ringing() -> SimulateConfig:
     """One cluster, 1 Hz, damping 0.1, nothing else moves."""
     return replace(
         MODERATE,
-        **{"n_clusters": 1, "loose_share": 0.0, "ambient_sway_m": 0.0, "touches_per_minute": 3.0, "duration_s": 60.0},
-        **{"sway_frequency_min_hz": 1.0, "sway_frequency_max_hz": 1.0, "damping_min": 0.1, "damping_max": 0.1},
+        n_clusters=1,
+        loose_share=0.0,
+        ambient_sway_m=0.0,
+        touches_per_minute=3.0,
+        duration_s=60.0,
+        sway_frequency_min_hz=1.0,
+        sway_frequency_max_hz=1.0,
+        damping_min=0.1,
+        damping_max=0.1,
     )
 
 
@@ -187,7 +194,7 @@ def test_the_camera_sweeps_slowly_and_looks_at_the_plant(name: str) -> None:
     for seed in range(4):
         plant = _plant(config, seed)
         T = camera_path(config, plant, times, rng=np.random.default_rng(seed))
-        np.testing.assert_allclose(T[:, :3, :3] @ np.swapaxes(T[:, :3, :3], 1, 2), np.eye(3)[None], atol=1e-12)
+        assert np.abs(T[:, :3, :3] @ np.swapaxes(T[:, :3, :3], 1, 2) - np.eye(3)).max() < 1e-12
         np.testing.assert_allclose(np.linalg.det(T[:, :3, :3]), 1.0)
         speed = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1) * config.fps
         assert 0.05 < speed.mean() < speed.max() <= 0.5

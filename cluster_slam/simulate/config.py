@@ -159,8 +159,10 @@ _STRANGE: dict[str, dict[str, Any]] = {
     "large": {"scale": 3.0},
     "tiny": {"n_clusters": 1, "flowers_min": 3, "flowers_max": 3, "loose_share": 0.0},
     "odometry": {
-        **{"pose_error": "odometry", "pose_frame": "T_world_camera"},
-        **{"pose_translation": 0.0005, "pose_rotation": 0.0005},
+        "pose_error": "odometry",
+        "pose_frame": "T_world_camera",
+        "pose_translation": 0.0005,
+        "pose_rotation": 0.0005,
     },
     "pixels": {"level": 2},
     "bare": {"with_covariances": False},
