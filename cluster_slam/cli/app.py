@@ -74,19 +74,27 @@ def run(arguments: Sequence[str], *, debug: bool = False) -> int:
     try:
         code = app(list(arguments), prog_name="cluster-slam", standalone_mode=False)
         sys.stdout.flush()
-    except BrokenPipeError:  # the reader of our output has gone, as in `... | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except (KeyboardInterrupt, typer.Abort):
-        _say("interrupted; nothing has been written")
-        return EXIT_INTERRUPTED
-    except typer.Exit as end:
-        return end.exit_code
+    except BrokenPipeError:
+        return _reader_gone()
+    except SystemExit as end:  # typer's own way to end on a broken pipe
+        if isinstance(end.__context__, BrokenPipeError):
+            return _reader_gone()
+        raise
+    except (typer.Abort, KeyboardInterrupt):
+        code = EXIT_INTERRUPTED
     except Exception as error:
         if debug:
             traceback.print_exc()
         return _explain(error)
+    if code == EXIT_INTERRUPTED:  # typer's answer to Ctrl-C
+        _say("interrupted; nothing has been written")
     return code if isinstance(code, int) else 0
+
+
+def _reader_gone() -> int:
+    """Whoever read our output has left, as in ``... | head``: that is no error."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
 
 
 def _explain(error: Exception) -> int:
@@ -95,6 +103,8 @@ def _explain(error: Exception) -> int:
         _say(str(error))
     elif callable(usage):
         context = getattr(error, "ctx", None)
+        if not usage():  # no command: help has been shown
+            return EXIT_BAD_INPUT
         _say(f"{usage()} (see {context.command_path if context else 'cluster-slam'} --help)")
     else:
         where = traceback.extract_tb(error.__traceback__)[-1]

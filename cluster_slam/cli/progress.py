@@ -48,8 +48,7 @@ class StageProgress:
         """Say what is done now and how far it is."""
         with self._lock:
             self._stage, self._fraction = stage, min(max(fraction, 0.0), 1.0)
-            if self._progress is not None and self._task is not None:
-                self._progress.update(self._task, description=self._stage, completed=self._fraction)
+            self._draw()
 
     def _show(self) -> None:
         from rich.console import Console
@@ -60,6 +59,14 @@ class StageProgress:
                 return
             columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
             self._progress = Progress(*columns, console=Console(stderr=True), transient=True)
-            self._task = self._progress.add_task(self._stage or "working", total=1.0)
-            self._progress.update(self._task, completed=self._fraction)
+            self._task = self._progress.add_task("working", total=None)
+            self._draw()
             self._progress.start()
+
+    def _draw(self) -> None:
+        """The bar as things stand; it only pulses as long as no fraction is known."""
+        if self._progress is not None and self._task is not None:
+            total = 1.0 if self._fraction > 0 else None
+            self._progress.update(
+                self._task, description=self._stage or "working", completed=self._fraction, total=total
+            )

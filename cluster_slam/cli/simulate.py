@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from cluster_slam.cli.options import ConfigOption, JsonOption, QuietOption, SeedOption, SetOption, configured
+from cluster_slam.cli.progress import StageProgress
 from cluster_slam.cli.summary import print_json, print_table
 from cluster_slam.errors import ConfigError
 
@@ -38,7 +39,9 @@ def command(
         hint = f"; did you mean {near[0]}?" if near else ""
         raise ConfigError(f"unknown preset {preset!r}{hint} (known: {', '.join(PRESETS)})")
     options = configured(PRESETS[preset], config, settings or [])
-    simulate(options, out, seed=seed)
+    with StageProgress(is_shown=not (quiet or as_json)) as progress:
+        progress("simulating", 0.0)
+        simulate(options, out, seed=seed)
     if as_json:
         print_json({"out": str(out), "preset": preset, "seed": seed, "config": asdict(options)})
     elif not quiet:
