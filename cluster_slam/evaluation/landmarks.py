@@ -8,9 +8,10 @@ import numpy as np
 
 from cluster_slam.geometry import Array
 from cluster_slam.records import Clusters, Flowers, IntArray, Truth
+from tracking.gating import chi2_threshold
 from tracking.metrics import IdentityScores
 
-_CHI2_3_95 = 7.814727903251179  # scipy.stats.chi2.ppf(0.95, 3), without its import
+NOMINAL = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)  # probabilities of the coverage curves
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +40,12 @@ class LandmarkErrors:
     @property
     def inside95(self) -> float:
         """Share inside the 95 % ellipsoid."""
-        return float((self.nees <= _CHI2_3_95 / 3.0).mean())
+        return float((3.0 * self.nees <= chi2_threshold(3, 0.95)).mean())
+
+    @property
+    def coverage(self) -> tuple[float, ...]:
+        """Share inside the ellipsoid of each of the probabilities ``NOMINAL``."""
+        return tuple(float((3.0 * self.nees <= chi2_threshold(3, p)).mean()) for p in NOMINAL)
 
 
 def normalised_squared(errors: Array, covs: Array) -> Array:

@@ -24,6 +24,7 @@ from cluster_slam.evaluation.trajectory import (
 )
 from cluster_slam.geometry import Array, inverse, se3_log, so3_log
 from cluster_slam.records import CLUTTER, IntArray, Result, Session, Truth
+from tracking.consistency import mean_band
 from tracking.metrics import IdentityScores, hota, identity_scores
 
 _OFTEN = 60  # frames that saw a flower, from which it counts as well observed
@@ -36,7 +37,9 @@ class Metrics:
     Trajectory: ``ate_rmse_m`` and ``ate_rotation_rad`` after rigid alignment of the positions, as the field reports
     them; ``*_unaligned`` as they are in ``world``; ``*_given`` the aligned error of the poses that came in. ``rpe_*``:
     over one second. Landmarks: matched by identity, unaligned in ``world`` unless the name says aligned. ``nees_*``:
-    mean of e' S^-1 e / dimension, 1 where covariances are true. ``clutter_*``: precision and recall of the label -1.
+    mean of e' S^-1 e / dimension, 1 where covariances are true; ``nees_*_low`` and ``high``: where 95 % of such means
+    lie if they are (common errors make them spread wider). ``clutter_*``: precision and recall of the label -1.
+    ``coverage_*``: shares inside the ellipsoids of the probabilities ``landmarks.NOMINAL``; not in ``metrics.json``.
     """
 
     ate_rmse_m: float | None = None
@@ -78,10 +81,16 @@ class Metrics:
     hand_eye_given_m: float | None = None
     hand_eye_given_rad: float | None = None
     nees_hand_eye: float | None = None
+    nees_flowers_low: float | None = None
+    nees_flowers_high: float | None = None
+    nees_clusters_low: float | None = None
+    nees_clusters_high: float | None = None
+    coverage_flowers: tuple[float, ...] | None = None
+    coverage_clusters: tuple[float, ...] | None = None
 
     def as_json(self) -> dict[str, float]:
         """The metrics that are known, in the order above; what is not finite is left out."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values = {f.name: getattr(self, f.name) for f in fields(self) if not f.name.startswith("coverage")}
         return {name: value for name, value in values.items() if value is not None and np.isfinite(value)}
 
 
@@ -195,6 +204,9 @@ def _landmarks(metrics: Metrics, matching: IdentityScores, result: Result, truth
         nees_flowers_median=float(np.median(flowers.nees)),
         inside95_flowers=flowers.inside95,
         n_clusters_compared=len(clusters),
+        nees_flowers_low=(band := mean_band(3, len(flowers))).low / 3.0,
+        nees_flowers_high=band.high / 3.0,
+        coverage_flowers=flowers.coverage,
     )
     if not len(clusters):
         return metrics
@@ -203,6 +215,9 @@ def _landmarks(metrics: Metrics, matching: IdentityScores, result: Result, truth
         cluster_rmse_m=_rms(clusters),
         nees_clusters=float(clusters.nees.mean()),
         inside95_clusters=clusters.inside95,
+        nees_clusters_low=(band := mean_band(3, len(clusters))).low / 3.0,
+        nees_clusters_high=band.high / 3.0,
+        coverage_clusters=clusters.coverage,
     )
 
 

@@ -8,8 +8,9 @@ from scipy.spatial import cKDTree
 from cluster_slam.geometry import Array
 from cluster_slam.records import IntArray
 
-# Okabe and Ito (2008): told apart with all common kinds of colour blindness; yellow and black left out
-PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+# Okabe and Ito (2008): told apart with all common kinds of colour blindness; yellow and black left out, the lighter
+# ones darkened for white paper. The page has the same ones as --c0 to --c5.
+PALETTE = ("#0072b2", "#d55e00", "#00855f", "#b85f92", "#3596d1", "#b97700")
 _NEIGHBOURS = 5  # one fewer than there are colours
 
 

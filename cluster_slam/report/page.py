@@ -14,11 +14,10 @@ import numpy as np
 from cluster_slam.evaluation import Metrics
 from cluster_slam.geometry import so3_log
 from cluster_slam.records import RejectReason, Result
-from cluster_slam.report.colours import PALETTE
 from cluster_slam.report.findings import NOISE_WORDS, find
 from cluster_slam.report.pack import rounded
 from cluster_slam.report.scene import scene_json
-from cluster_slam.report.statistics import Summary, hand_eye_correction, misfit_curve, summarise
+from cluster_slam.report.statistics import Summary, coverage_curves, hand_eye_correction, misfit_curve, summarise
 from cluster_slam.report.summary import headline, scores, sentences, tiles
 from cluster_slam.report.words import REASON_WORDS
 
@@ -74,11 +73,11 @@ def page_json(result: Result, metrics: Metrics | None) -> dict[str, object]:
         "tiles": [asdict(tile) for tile in tiles(result, summary)],
         "findings": [asdict(finding) for finding in find(result, summary, metrics)],
         "scores": [asdict(score) for score in scores(metrics)],
-        "palette": PALETTE,
         "reasons": [asdict(REASON_WORDS[reason]) for reason in RejectReason],
         "rejected": [[int(reason), n] for reason, n in summary.rejected],
         "accepted": summary.n_observations - summary.n_rejected,
         "misfit": _misfit(result, summary),
+        "coverage": [asdict(curve) for curve in coverage_curves(result, metrics)],
         "noise": _noise(result),
         "calibration": _calibration(result),
         "run": _run(result),

@@ -137,7 +137,7 @@ def _drift(result: Result, moved: Sway) -> dict[str, object]:
 
 def _kept(result: Result) -> _Seen:
     frame = result.session.observations.frame
-    every = 1 + len(frame) // (MAX_OBSERVATIONS + 1)
+    every = max(1, -(-len(frame) // MAX_OBSERVATIONS))
     rows = np.flatnonzero(frame % every == 0)
     return _Seen(rows[np.argsort(frame[rows], kind="stable")], every)
 

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cluster_slam.evaluation import Metrics
+from cluster_slam.evaluation.landmarks import NOMINAL
 from cluster_slam.evaluation.trajectory import absolute_error
 from cluster_slam.geometry import Array, inverse, se3_log, transform
 from cluster_slam.records import CLUTTER, IntArray, RejectReason, Result
-from tracking.consistency import mean_band
+from tracking.consistency import mean_band, share_band
 from tracking.gating import chi2_threshold
 
 _BINS = 160  # of the time axis of the chart of misfits
@@ -137,12 +139,43 @@ def misfit_curve(result: Result) -> MisfitCurve:
     kept = np.flatnonzero(n)
     bands = [mean_band(3, int(k)) for k in n[kept]]
     return MisfitCurve(
-        (kept + 0.5) * width,
-        np.asarray(total[kept] / n[kept], dtype=np.float64),
+        np.asarray((kept + 0.5) * width, dtype=np.float64),
+        total[kept] / n[kept],
         np.array([b.low for b in bands]),
         np.array([b.high for b in bands]),
         n[kept],
     )
+
+
+@dataclass(frozen=True, slots=True)
+class CoverageCurve:
+    """Shares of errors inside the regions that should hold so many of them."""
+
+    name: str
+    nominal: tuple[float, ...]
+    actual: tuple[float, ...]
+    low: tuple[float, ...]  # where 95 % of such shares lie, if all is true and independent
+    high: tuple[float, ...]
+    n: int
+
+
+def coverage_curves(result: Result, metrics: Metrics | None) -> tuple[CoverageCurve, ...]:
+    """Of the accepted detections, and against truth of flowers and clusters."""
+    nis = result.diagnostics.nis[np.isfinite(result.diagnostics.nis)]
+    curves = []
+    if len(nis):
+        shares = tuple(float((nis <= chi2_threshold(3, p)).mean()) for p in NOMINAL)
+        curves.append(_coverage_curve("detections", shares, len(nis)))
+    if metrics is not None and metrics.coverage_flowers and metrics.n_flowers_compared:
+        curves.append(_coverage_curve("flowers against truth", metrics.coverage_flowers, metrics.n_flowers_compared))
+    if metrics is not None and metrics.coverage_clusters and metrics.n_clusters_compared:
+        curves.append(_coverage_curve("clusters against truth", metrics.coverage_clusters, metrics.n_clusters_compared))
+    return tuple(curves)
+
+
+def _coverage_curve(name: str, actual: tuple[float, ...], n: int) -> CoverageCurve:
+    bands = [share_band(p, n) for p in NOMINAL]
+    return CoverageCurve(name, NOMINAL, actual, tuple(b.low for b in bands), tuple(b.high for b in bands), n)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

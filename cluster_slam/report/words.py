@@ -59,7 +59,7 @@ def digits(value: float) -> str:
         return "unknown"
     if size < 1e-9:
         return "0"
-    decimals = max(0, 1 - math.floor(math.log10(size)))
+    decimals = max(0, 1 - math.floor(math.log10(float(f"{size:.1e}"))))
     return f"{value:,.{min(decimals, 6)}f}"
 
 

@@ -8,7 +8,7 @@ function chart(box, spec) {
   node.style.height = `${made.height}px`;
   node.addEventListener("mousemove", (event) => hoverChart(made, event));
   node.addEventListener("mouseleave", hideTip);
-  node.addEventListener("click", (event) => change({ frame: nearestFrame(timeAt(made, event)), playing: false }));
+  if (!spec.domain) node.addEventListener("click", (event) => change({ frame: nearestFrame(timeAt(made, event)), playing: false }));
   charts.push(made);
   drawChart(made);
   return made;
@@ -29,7 +29,7 @@ function axes(made) {
   const { spec, node, height } = made;
   const width = node.clientWidth || 300;
   const left = spec.left || 46;
-  const [t0, t1] = [0, Math.max(scene.stamps[nFrames - 1] || 0, 1e-3)];
+  const [t0, t1] = spec.domain || [0, Math.max(scene.stamps[nFrames - 1] || 0, 1e-3)];
   const [y0, y1] = spec.range;
   const x = (t) => left + ((t - t0) / (t1 - t0)) * (width - left - 10);
   const y = (v) => height - 34 - ((v - y0) / (y1 - y0)) * (height - 44);
@@ -53,7 +53,7 @@ function drawChart(made) {
   g.font = "12px system-ui, sans-serif";
   drawAxes(g, a, spec);
   for (const layer of spec.layers) LAYERS[layer.kind](g, a, layer);
-  if (state.frame !== null) rule(g, a.x(scene.stamps[state.frame]), a.y(a.y0), a.y(a.y1), css("--accent"));
+  if (state.frame !== null && !spec.domain) rule(g, a.x(scene.stamps[state.frame]), a.y(a.y0), a.y(a.y1), css("--accent"));
 }
 
 function drawAxes(g, a, spec) {
@@ -69,7 +69,7 @@ function drawAxes(g, a, spec) {
   Object.assign(g, { textAlign: "center", textBaseline: "top" });
   for (const [t, text] of labelled(a.t0, a.t1, Math.max(2, Math.floor(a.width / 90)))) g.fillText(text, a.x(t), a.height - 30);
   g.textAlign = "right";
-  g.fillText("seconds", a.width - 10, a.height - 15);
+  g.fillText(spec.xlabel || "seconds", a.width - 10, a.height - 15);
   g.textAlign = "left";
   if (spec.unit) g.fillText(spec.unit, 2, a.height - 15);
 }
@@ -97,7 +97,8 @@ const LAYERS = {
     g.fillStyle = css("--band");
     g.fill();
   },
-  line(g, a, { t, v, colour, gap }) {
+  line(g, a, { t, v, colour, gap, dash }) {
+    g.setLineDash(dash || []);
     g.beginPath();
     for (let i = 0; i < t.length; i++) {
       if (i && t[i] - t[i - 1] > (gap || Infinity)) g.moveTo(a.x(t[i]), clip(a, v[i]));
@@ -105,6 +106,7 @@ const LAYERS = {
     }
     Object.assign(g, { strokeStyle: colour.startsWith("--") ? css(colour) : colour, lineWidth: 1.4 });
     g.stroke();
+    g.setLineDash([]);
   },
   dots(g, a, { t, v, colour, size }) {
     g.fillStyle = colour.startsWith("--") ? css(colour) : colour;

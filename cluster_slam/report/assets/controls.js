@@ -160,12 +160,12 @@ function hoverCluster(index) {
 }
 
 function legend() {
-  const ink = css("--ink");
+  const [ink, blue] = [css("--ink"), css("--c0")];
   const mark = (inner) => `<svg viewBox="0 0 22 12" aria-hidden="true">${inner}</svg>`;
   const path = pathFactor() > 1 ? `, ${state.magnify} times farther from the solid line` : "";
   const items = [
-    [mark(`<circle cx="11" cy="6" r="3" fill="${data.palette[0]}"/>`), "flower at rest"],
-    [mark(`<ellipse cx="11" cy="6" rx="9" ry="5" fill="${data.palette[0]}33" stroke="${data.palette[0]}"/>`), `95 % ellipsoid${state.magnify > 1 ? `, ${state.magnify} times its size` : ""}`],
+    [mark(`<circle cx="11" cy="6" r="3" fill="${blue}"/>`), "flower at rest"],
+    [mark(`<ellipse cx="11" cy="6" rx="9" ry="5" fill="${blue}33" stroke="${blue}"/>`), `95 % ellipsoid${state.magnify > 1 ? `, ${state.magnify} times its size` : ""}`],
     [mark(`<path d="M0 6H22" stroke="${ink}" stroke-width="2"/>`), "camera path, corrected"],
     [mark(`<path d="M0 6H22" stroke="${css("--reject")}" stroke-dasharray="3 3" stroke-width="1.5"/>`), `camera path as given${path}`],
     ["", `grid ${length(floorStep)}`],

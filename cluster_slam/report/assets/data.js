@@ -20,7 +20,7 @@ function unpackAll(node) {
 const data = unpackAll(JSON.parse(byId("data").textContent));
 const scene = data.scene;
 const nFrames = scene.stamps.length;
-const colourOf = (cluster) => data.palette[cluster.colour];
+const colourOf = (cluster) => `--c${cluster.colour}`;
 
 scene.clusters.forEach((cluster, index) => {
   cluster.index = index;

@@ -22,7 +22,7 @@ function showDetail() {
   const seen = observationsOf(cluster);
   const charts = [swayChart(cluster), sightings(cluster, seen), gateChart(cluster, seen)];
   const close = element("button", { type: "button", class: "quiet", onclick: () => change({ cluster: null }) }, "Close");
-  const title = element("h2", {}, element("span", { class: "dot", colour: colourOf(cluster) }), `Cluster ${cluster.id}: ${plural(cluster.n, "flower")}`);
+  const title = element("h2", {}, element("span", { class: "dot", colour: `var(${colourOf(cluster)})` }), `Cluster ${cluster.id}: ${plural(cluster.n, "flower")}`);
   const left = element("div", {}, ...charts.flatMap((c) => [element("p", { class: "chart-title" }, c.title), c.box]), closestCalls(seen));
   const right = element("div", {}, ...facts(cluster, seen), flowerTable(cluster), rejectedNear(seen));
   box.replaceChildren(element("div", { class: "bar" }, title, close), element("div", { class: "detail-grid" }, left, right));

@@ -3,7 +3,7 @@ function digits(value) {
   if (value === null || !Number.isFinite(value)) return "–";
   const size = Math.abs(value);
   if (size < 1e-9) return "0";
-  const decimals = Math.min(6, Math.max(0, 1 - Math.floor(Math.log10(size))));
+  const decimals = Math.min(6, Math.max(0, 1 - Math.floor(Math.log10(Number(size.toPrecision(2))))));
   return value.toLocaleString("en-US", { minimumFractionDigits: decimals, maximumFractionDigits: decimals });
 }
 

@@ -118,7 +118,7 @@ function landmarks() {
   for (const flower of scene.flowers) {
     const cluster = scene.clusters[flower.c];
     const faded = chosen !== null && chosen !== flower.c;
-    const colour = colourOf(cluster);
+    const colour = css(colourOf(cluster));
     add(flower.p, () => {
       pen.globalAlpha = faded ? 0.35 : 1;
       if (cluster.n > 1) line([cluster.p, flower.p], colour, chosen === flower.c ? 1.5 : 0.9);
@@ -129,7 +129,7 @@ function landmarks() {
   }
   for (const cluster of scene.clusters) {
     if (cluster.n === 1) continue;
-    add(cluster.p, () => ellipsoid(cluster.p, cluster.cov, colourOf(cluster), chosen === cluster.index || chosen === null));
+    add(cluster.p, () => ellipsoid(cluster.p, cluster.cov, css(colourOf(cluster)), chosen === cluster.index || chosen === null));
   }
   return out;
 }
@@ -166,7 +166,7 @@ function paintFrame(frame) {
     if (!q) continue;
     const known = seen.flower[k] !== NONE;
     if (known) {
-      const colour = colourOf(scene.clusters[scene.flowers[seen.flower[k]].c]);
+      const colour = css(colourOf(scene.clusters[scene.flowers[seen.flower[k]].c]));
       line([eye, p], colour, 0.35);
       mark(p, colour, 4);
       pen.beginPath();

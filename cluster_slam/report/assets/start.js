@@ -7,6 +7,7 @@ function redraw() {
 
 function setTheme(theme) {
   document.documentElement.dataset.theme = theme;
+  themed.clear();
 }
 
 function tips() {
@@ -56,6 +57,7 @@ function start() {
   fitView("all");
   chooseMagnify();
   fillMisfit();
+  fillCoverage();
   listen((update) => {
     if ("cluster" in update) {
       markRow();

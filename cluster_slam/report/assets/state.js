@@ -26,4 +26,10 @@ function element(name, attributes = {}, ...children) {
 }
 
 const byId = (id) => document.getElementById(id);
-const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+
+// Values of the theme's variables, kept until the theme changes.
+const themed = new Map();
+function css(name) {
+  if (!themed.has(name)) themed.set(name, getComputedStyle(document.documentElement).getPropertyValue(name).trim());
+  return themed.get(name);
+}

@@ -29,7 +29,7 @@ function buildTable() {
   byId("clusters").replaceChildren(element("thead", {}, element("tr", {}, ...heads)), body);
   for (const cluster of scene.clusters) {
     const cells = made.map((c) => element("td", { class: c.key === "state" ? "text" : null }, c.text(cluster)));
-    cells[0].prepend(element("span", { class: "dot", colour: colourOf(cluster) }));
+    cells[0].prepend(element("span", { class: "dot", colour: `var(${colourOf(cluster)})` }));
     const toggle = () => change({ cluster: state.cluster === cluster.index ? null : cluster.index });
     const onkeydown = (event) => (event.key === "Enter" || event.key === " ") && (event.preventDefault(), toggle());
     body.append(element("tr", { tabindex: 0, "data-cluster": cluster.index, "aria-selected": "false", onclick: toggle, onkeydown }, ...cells));

@@ -69,6 +69,29 @@ function fillMisfit() {
   chart(byId("misfit"), { range: [0, top], layers, read, height: 220, label: "Misfit over time with its 95 % band" });
 }
 
+function fillCoverage() {
+  if (!data.coverage.length) return;
+  byId("coverage-title").hidden = false;
+  const colours = { detections: "--accent", "flowers against truth": "--c1", "clusters against truth": "--c2" };
+  const key = data.coverage.map((c) => {
+    const sample = element("span", { class: "dot", colour: `var(${colours[c.name]})` });
+    return element("li", {}, sample, `${c.name} (${whole(c.n)}): ${(100 * c.actual[9]).toFixed(1)} % inside 95 %`);
+  });
+  const widest = data.coverage[data.coverage.length - 1];
+  const layers = [{ kind: "band", t: widest.nominal, low: widest.low, high: widest.high }, { kind: "line", t: [0, 1], v: [0, 1], colour: "--soft", dash: [4, 3] }];
+  for (const c of data.coverage) {
+    layers.push({ kind: "line", t: [0, ...c.nominal], v: [0, ...c.actual], colour: colours[c.name] });
+    layers.push({ kind: "dots", t: c.nominal, v: c.actual, colour: colours[c.name], size: 2 });
+  }
+  const read = (p) => {
+    const i = nearest(widest.nominal, p);
+    return [`Should be ${Math.round(100 * widest.nominal[i])} %`, ...data.coverage.map((c) => `${c.name}: ${(100 * c.actual[i]).toFixed(1)} %`)].join("; ");
+  };
+  const box = element("div");
+  byId("coverage").replaceChildren(box, element("ul", { class: "legend" }, ...key));
+  chart(box, { range: [0, 1], domain: [0, 1], xlabel: "probability", layers, read, height: 230, label: "Actual against nominal probability" });
+}
+
 function fillRun() {
   const r = data.run;
   const join = (o, f) => Object.entries(o).map(([k, v]) => `${k.replaceAll("_", " ")} ${f(v)}`).join(", ");
