@@ -198,8 +198,10 @@ def test_the_camera_sweeps_slowly_and_looks_at_the_plant(name: str) -> None:
         np.testing.assert_allclose(np.linalg.det(T[:, :3, :3]), 1.0)
         speed = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1) * config.fps
         assert 0.05 < speed.mean() < speed.max() <= 0.5
-        ahead = ((plant.centroids.mean(0) - T[:, :3, 3]) * T[:, :3, 2]).sum(1)
-        assert (ahead > 0.2 * config.scale).all()
+        assert (plant.centroids[:, 1].mean() - T[:, 1, 3] > 0.2 * config.scale).all()  # the arm's side of the row
+        rays = plant.centroids - T[:, None, :3, 3]
+        off_axis = np.arccos((rays @ T[:, :3, 2, None])[..., 0] / np.linalg.norm(rays, axis=2)).min(1)
+        assert np.rad2deg(np.median(off_axis)) < 20 < np.rad2deg(off_axis.max()) + 20 < 80  # a cluster ahead
         turned = np.linalg.norm(se3_log(inverse(T[:1]) @ T)[:, :3], axis=1).max()
         assert turned > 0.5 if config.turn_rad else turned < 1e-9
 
