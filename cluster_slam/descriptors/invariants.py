@@ -68,7 +68,7 @@ class UnscentedDescriptor:
 
 
 def distance_and_axes(points: Array) -> Array:
-    """Mean distance to the centroid and the root mean square sizes along the principal axes (..., 1 + min(3, n - 1)), m.
+    """Mean distance to the centroid and the root mean square sizes along the principal axes (..., 1 + min(3, n - 1)).
 
     The squares of the sizes are the eigenvalues of the scatter matrix over n, largest first; those that n members
     cannot have are left out. Two members have one number only.
