@@ -124,7 +124,7 @@ def test_a_touch_rings_down_as_a_damped_oscillator() -> None:
     ratio = size[peaks[1:]] / size[peaks[:-1]]
     decay = np.exp(-np.pi * 0.1 / np.sqrt(1 - 0.1**2))
     assert np.median(ratio[regular]) == pytest.approx(decay, rel=1e-3)
-    assert 0.5 * config.sway_m * 0.6 <= size.max() <= config.sway_m
+    assert 0.6 * config.sway_m * 0.7 * 0.9 <= size.max() <= config.sway_m
 
 
 @settings(max_examples=20, deadline=None)

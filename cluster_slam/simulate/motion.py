@@ -103,7 +103,7 @@ def _push(config: SimulateConfig, plant: Plant, rng: np.random.Generator) -> Arr
     n = len(plant.centroids)
     place = plant.centroids[rng.integers(n)] + rng.normal(0.0, 0.05 * config.scale, 3)
     away = np.linalg.norm(plant.centroids - place, axis=1) / (config.touch_reach_m * config.scale)
-    size = config.sway_m * rng.uniform(0.5, 1.0) * np.exp(-0.5 * away**2) * rng.uniform(0.6, 1.0, n)
+    size = config.sway_m * rng.uniform(0.6, 1.0) * np.exp(-0.5 * away**2) * rng.uniform(0.7, 1.0, n)
     direction = rng.normal(size=3)
     direction = direction / np.linalg.norm(direction) + rng.normal(0.0, 0.2, (n, 3))
     direction -= (1 - _ALONG_STEM) * (direction * plant.tangents).sum(1, keepdims=True) * plant.tangents
