@@ -29,7 +29,7 @@ from cluster_slam.simulate.config import SimulateConfig
 
 MADE = make(3, n_frames=60)
 HEAVY = ["numpy", "scipy", "gtsam", "cv2", "plotly", "matplotlib", "filterpy", "onnxruntime", "sqlite3"]
-COMMANDS = ["smooth", "simulate", "evaluate", "check"]
+COMMANDS = ["smooth", "simulate", "evaluate", "check", "figures"]
 Smooth = Callable[..., Result]
 
 
@@ -166,12 +166,10 @@ def test_the_output_is_checked_before_any_work(
 
 
 def test_options_reach_the_method(session: Path, smoother: dict[str, Any], tmp_path: Path) -> None:
-    (tmp_path / "options.toml").write_text("gate_probability = 0.9\nmax_rounds = 5\n[grouping]\nlinkage_m = 0.1\n")
+    (tmp_path / "options.toml").write_text("max_rounds = 5\n[grouping]\nlinkage_m = 0.1\n")
     arguments = ["--config", str(tmp_path / "options.toml"), "--set", "max_rounds=2", "--clusters", "7", "--quiet"]
     assert run(["smooth", str(session), "-o", str(tmp_path / "out"), *arguments]) == 0
-    expected = replace(
-        SmoothConfig(), gate_probability=0.9, max_rounds=2, grouping=GroupingConfig("kmeans", 7, linkage_m=0.1)
-    )
+    expected = replace(SmoothConfig(), max_rounds=2, grouping=GroupingConfig("kmeans", 7, linkage_m=0.1))
     assert smoother["config"] == expected
 
 
@@ -179,8 +177,8 @@ def test_options_reach_the_method(session: Path, smoother: dict[str, Any], tmp_p
 
 
 def test_settings_are_toml_or_words() -> None:
-    assert configured(SmoothConfig(), None, ["gate_probability=0.5", "grouping.method=branch"]) == replace(
-        SmoothConfig(), gate_probability=0.5, grouping=GroupingConfig("branch")
+    assert configured(SmoothConfig(), None, ["max_rounds=9", "grouping.method=branch"]) == replace(
+        SmoothConfig(), max_rounds=9, grouping=GroupingConfig("branch")
     )
     assert configured(SimulateConfig(), None, ["n_clusters = 3"]).n_clusters == 3
 
@@ -188,7 +186,7 @@ def test_settings_are_toml_or_words() -> None:
 @pytest.mark.parametrize(
     ("setting", "says"),
     [
-        ("gate_probabilty=1", "unknown option gate_probabilty; did you mean gate_probability?"),
+        ("max_round=1", "unknown option max_round; did you mean max_rounds?"),
         ("grouping.metod=none", "unknown option grouping.metod; did you mean grouping.method?"),
         ("grouping.method=magic", "option grouping.method is 'magic', expected 'spacing', 'kmeans'"),
         ("grouping.n_clusters=many", "option grouping.n_clusters is 'many', expected a valid integer"),
@@ -211,7 +209,7 @@ def test_kmeans_and_the_number_of_clusters_come_together() -> None:
 
 
 def test_a_configuration_that_is_no_toml(tmp_path: Path) -> None:
-    (tmp_path / "a.toml").write_text("gate_probability: 1")
+    (tmp_path / "a.toml").write_text("max_rounds: 1")
     with pytest.raises(ConfigError, match=r"a.toml: .*, expected TOML"):
         configured(SmoothConfig(), tmp_path / "a.toml", [])
 
@@ -254,6 +252,23 @@ def test_evaluate_without_truth(smoother: dict[str, Any], tmp_path: Path, capsys
     assert run(["smooth", str(tmp_path / "session"), "-o", str(tmp_path / "out"), "--quiet"]) == 0
     assert run(["evaluate", str(tmp_path / "out"), str(tmp_path / "session")]) == 2
     assert "truth: missing, expected ground truth" in capsys.readouterr().err
+
+
+def test_figures_find_the_session_by_themselves(
+    session: Path, smoother: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, pictures = tmp_path / "out", tmp_path / "pictures"
+    assert run(["smooth", str(session), "-o", str(out), "--quiet"]) == 0
+    assert run(["figures", str(out), "-o", str(pictures), "--formats", "svg", "--json"]) == 0
+    paths = json.loads(capsys.readouterr().out)["figures"]
+    assert paths
+    assert sorted(paths) == sorted(str(path) for path in pictures.iterdir())
+    assert run(["figures", str(out), "-o", str(out / "figures")]) == 2
+    assert "inside of the result" in capsys.readouterr().err
+    session.rename(tmp_path / "moved")
+    assert run(["figures", str(out), "-o", str(pictures)]) == 2
+    assert "expected SESSION after RESULT" in capsys.readouterr().err
+    assert run(["figures", str(out), str(tmp_path / "moved"), "-o", str(pictures), "--formats", "svg", "--quiet"]) == 0
 
 
 def test_check_says_what_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

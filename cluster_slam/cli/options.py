@@ -57,7 +57,7 @@ def _nested(setting: str) -> dict[str, Any]:
     """``a.b=1`` as ``{"a": {"b": 1}}``; a value that is no TOML is a word."""
     key, equals, text = setting.partition("=")
     if not (equals and key.strip()):
-        raise ConfigError(f"--set {setting!r}, expected KEY=VALUE, as in --set gate_probability=0.95")
+        raise ConfigError(f"--set {setting!r}, expected KEY=VALUE, as in --set max_rounds=5")
     try:
         value: Any = tomllib.loads(f"value = {text.strip()}")["value"]
     except (tomllib.TOMLDecodeError, KeyError):

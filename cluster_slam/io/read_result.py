@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -183,13 +184,22 @@ def _calibration(path: Path) -> Calibration | None:
     return Calibration(pose_from_tum(T), cov, tuple(str(words) for words in content.get("unobserved", ())))
 
 
-def read_level(path: str | Path) -> int | None:
-    """The level that the result of a folder was made from; None where it does not say.
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """What a result was made from; None where it does not say."""
+
+    session: Path | None
+    level: int | None
+
+
+def read_origin(path: str | Path) -> Origin:
+    """The session and the level that the result of a folder was made from.
 
     Raises
     ------
     InputError
         No result's ``run.json``.
     """
-    level = _json(Path(path) / "run.json").get("level")
-    return level if isinstance(level, int) else None
+    run = _json(Path(path) / "run.json")
+    session, level = run.get("session_path"), run.get("level")
+    return Origin(Path(session) if isinstance(session, str) else None, level if isinstance(level, int) else None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -140,6 +141,7 @@ def run_record(result: Result, files: list[str]) -> dict[str, Any]:
         "version": __version__,
         "command": result.command,
         "session": result.session.id,
+        "session_path": None if result.session.path is None else os.path.abspath(result.session.path),
         "level": result.session.level,
         "config": result.config,
         "seed": result.seed,
