@@ -34,7 +34,7 @@ def scene_json(result: Result) -> dict[str, object]:
     seen = _kept(result)
     stamps = result.session.stamps
     return {
-        "up": _up(result.T_world_camera),
+        "up": up_axis(result.T_world_camera),
         "start": float(stamps[0]) if len(stamps) else 0.0,
         "stamps": pack(stamps - stamps[:1], "f4"),
         "after": pack(result.T_world_camera[:, :3, 3], "f4"),
@@ -48,7 +48,7 @@ def scene_json(result: Result) -> dict[str, object]:
     }
 
 
-def _up(T_world_camera: Array) -> list[float]:
+def up_axis(T_world_camera: Array) -> list[float]:
     """The axis of the world that is nearest to the camera's upward direction, on average."""
     mean = -T_world_camera[:, :3, 1].mean(0) if len(T_world_camera) else np.array([0.0, 0.0, 1.0])
     k = int(np.abs(mean).argmax())
