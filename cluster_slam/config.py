@@ -18,16 +18,49 @@ class GroupingConfig:
 
     method: GroupingMethod = "spacing"  # average linkage on distance and common motion
     n_clusters: int | None = None  # for "kmeans"
-    linkage_m: float | None = None  # cut of the linkage; None: from the gap in the spacing of the flowers
+    linkage_m: float | None = None  # cut of the linkage; None: linkage_per_spacing
+    linkage_per_spacing: float = 3.7  # cut as a multiple of the median distance of a flower to its nearest
+
+
+@dataclass(frozen=True, slots=True)
+class TrackletConfig:
+    """Options of the pieces."""
+
+    gate_chi2: float = 16.0  # 3 degrees of freedom: 99.9 % of true matches, the pieces are short
+    walk_m_per_sqrt_s: float = 0.002  # random walk of a calm flower; None-zero keeps the filter awake
+    max_gap_s: float = 0.3  # a piece survives so long unseen ...
+    max_gap_frames: int = 3  # ... or so many frames, whichever is longer
+    min_age: int = 3  # observations before a piece helps to find the frame's pose
+
+
+@dataclass(frozen=True, slots=True)
+class TemplateConfig:
+    """Options of the clusters' following."""
+
+    gate_chi2: float = 16.0  # 3 degrees of freedom
+    landmark_sigma_m: float = 0.0004  # how well a place at rest is known
+    rest_accel: float = 0.15  # m/s^2, unmodelled acceleration of a cluster at rest
+    sway_hz: float = 1.35  # natural frequency of the spring; wrong by a factor of two is covered by the noise
+    sway_spread: float = 0.7  # share of the spring's acceleration that is unknown
+    reach_m: float = 0.06  # how far a search looks from rest ...
+    reach_unseen_m: float = 0.12  # ... when the cluster was not seen for some frames
+    jump_sigma_m: float = 0.025  # a shake's first step
+    jump_speed: float = 0.25  # m/s, one sigma of the velocity after a jump
+    match_gain: float = 7.0  # log-likelihood of a match over that of clutter, at distance zero
+    min_score: float = 6.0  # of an accepted hypothesis
+    forget_frames: int = 40  # unseen for so long: back to rest
 
 
 @dataclass(frozen=True, slots=True)
 class SmoothConfig:
     """Options of ``smooth``."""
 
-    gate_probability: float = 0.99  # share of true matches that a gate lets through
-    grouping: GroupingConfig = field(default_factory=GroupingConfig)
     max_rounds: int = 3  # associate, smooth, associate again: at most so often
+    outlier_probability: float = 0.999  # a true match is kept in the smoothing with this probability
+    min_observations: int = 8  # of a confirmed flower; fewer where the session has few frames
+    tracklets: TrackletConfig = field(default_factory=TrackletConfig)
+    follow: TemplateConfig = field(default_factory=TemplateConfig)
+    grouping: GroupingConfig = field(default_factory=GroupingConfig)
 
 
 C = TypeVar("C")

@@ -124,7 +124,8 @@ def _found_landmarks(mean: Array, quality: Array, presence: Array, radius: float
         near = np.flatnonzero(distance < radius)
         near = near[np.argsort(distance[near], kind="stable")]
         both = (seen[near] & presence[i]).sum(axis=1)
-        allowed = both <= np.maximum(2, shared * np.minimum(seen[near].sum(axis=1), presence[i].sum()))
+        fewer = np.minimum(seen[near].sum(axis=1), presence[i].sum())
+        allowed = both <= np.maximum(np.minimum(2, 0.1 * fewer), shared * fewer)
         if allowed.any():
             j = near[allowed][0]
         else:

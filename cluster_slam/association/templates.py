@@ -14,26 +14,9 @@ import numpy as np
 
 from cluster_slam.association.frames import Frames, information, point_jacobian
 from cluster_slam.association.tracklets import match, solve_pose_correction
+from cluster_slam.config import TemplateConfig
 from cluster_slam.geometry import Array, inverse, rotate_cov, se3_exp, transform
 from cluster_slam.records import IntArray
-
-
-@dataclass(frozen=True, slots=True)
-class TemplateConfig:
-    """Options of the clusters' following."""
-
-    gate_chi2: float = 16.0  # 3 degrees of freedom
-    landmark_sigma_m: float = 0.0004  # how well a place at rest is known
-    rest_accel: float = 0.15  # m/s^2, unmodelled acceleration of a cluster at rest
-    sway_hz: float = 1.35  # natural frequency of the spring; wrong by a factor of two is covered by the noise
-    sway_spread: float = 0.7  # share of the spring's acceleration that is unknown
-    reach_m: float = 0.06  # how far a search looks from rest ...
-    reach_unseen_m: float = 0.12  # ... when the cluster was not seen for some frames
-    jump_sigma_m: float = 0.025  # a shake's first step
-    jump_speed: float = 0.25  # m/s, one sigma of the velocity after a jump
-    match_gain: float = 7.0  # log-likelihood of a match over that of clutter, at distance zero
-    min_score: float = 6.0  # of an accepted hypothesis
-    forget_frames: int = 40  # unseen for so long: back to rest
 
 
 @dataclass(frozen=True, slots=True, eq=False)

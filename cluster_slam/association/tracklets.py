@@ -13,19 +13,9 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from cluster_slam.association.frames import Frames, chi2_and_log_det, information, point_jacobian
+from cluster_slam.config import TrackletConfig
 from cluster_slam.geometry import Array, adjoint, inverse, rotate_cov, se3_exp, transform
 from cluster_slam.records import IntArray
-
-
-@dataclass(frozen=True, slots=True)
-class TrackletConfig:
-    """Options of the pieces."""
-
-    gate_chi2: float = 16.0  # 3 degrees of freedom: 99.9 % of true matches, the pieces are short
-    walk_m_per_sqrt_s: float = 0.002  # random walk of a calm flower; None-zero keeps the filter awake
-    max_gap_s: float = 0.3  # a piece survives so long unseen ...
-    max_gap_frames: int = 3  # ... or so many frames, whichever is longer
-    min_age: int = 3  # observations before a piece helps to find the frame's pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,0 +1,262 @@
+"""All of a session in one factor graph: camera poses, hand-eye transform, flowers at rest, displacements of clusters.
+
+Unknowns, with their keys: z_i tangent of camera pose i, x tangent of the hand-eye transform, l_j place of flower j at rest,
+d_p displacement that all flowers of one cluster share in one frame (a "pair" p), b_s mean displacement of a cluster over a
+stretch of frames in which it moves. An observation k of flower j in frame i is
+
+    c_k = T_world_camera[i]^-1 (l_j + d_p) + noise
+
+The residuals are linearised for all observations at once in NumPy; GTSAM eliminates the Gaussian factor graph (frames
+first, then flowers) and gives the joint marginal of flowers and hand-eye transform. Wrong associations are weighted out
+by graduated non-convexity with truncated least squares (Yang et al., "Graduated Non-Convexity for Robust Spatial
+Perception", RA-L 2020, eq. 14 and remark 5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from cluster_slam.association.frames import Frames
+from cluster_slam.geometry import Array, adjoint, inverse, se3_exp, se3_log, skew
+from cluster_slam.records import IntArray
+
+_UNIT = {3: gtsam.noiseModel.Unit.Create(3), 6: gtsam.noiseModel.Unit.Create(6)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """Cluster-in-frame pairs: ``of`` (m,) pair of each observation (-1 none), and of each pair frame, cluster, sigma.
+
+    ``sigma`` (p,) m is how far the cluster may be from rest in that frame, ``stretch`` (p,) numbers the stretches of
+    motion (-1 at rest), ``stretch_sigma`` (s,) m is how far a whole stretch's mean may be from rest.
+    """
+
+    of: IntArray
+    frame: IntArray
+    cluster: IntArray
+    sigma: Array
+    stretch: IntArray
+    stretch_sigma: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseModel:
+    """What is known of the poses. ``given`` (n, 4, 4) are the flange's (with ``X0``) or the camera's (``X0`` None).
+
+    ``cov`` (6, 6): each pose for itself; ``cov_step`` (n - 1, 6, 6): odometry from frame to frame (None: absolute).
+    ``cov_hand_eye`` (6, 6): the prior of the hand-eye tangent.
+    """
+
+    given: Array
+    cov: Array
+    cov_step: Array | None
+    X0: Array | None
+    cov_hand_eye: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The unknowns: camera poses (n, 4, 4), hand-eye (4, 4) or None, places (l, 3), displacements (p, 3), weights (m,)."""
+
+    T: Array
+    X: Array | None
+    places: Array
+    d: Array
+    weight: Array
+    residual_chi2: Array  # (m,) NaN where unassigned
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Marginals:
+    """Joint covariance of all places (3 l, 3 l) and of the hand-eye tangent (6, 6)."""
+
+    places: Array
+    hand_eye: Array | None
+
+
+class _Keys:
+    """Integer keys of the unknowns, in the order of elimination: d, z, b, l, x."""
+
+    def __init__(self, n_pairs: int, n_frames: int, n_stretches: int, n_places: int) -> None:
+        ends = np.cumsum([n_pairs, n_frames, n_stretches, n_places, 1])
+        self.d, self.z, self.b, self.l, self.x = 0, int(ends[0]), int(ends[1]), int(ends[2]), int(ends[3])
+
+
+class BatchSmoother:
+    """Gauss-Newton on the whole session with the association given."""
+
+    def __init__(
+        self, frames: Frames, poses: PoseModel, landmark: IntArray, pairs: Pairs, noise_scale: float = 1.0
+    ) -> None:
+        """``landmark`` (m,) flower of each sorted observation or -1; stated covariances times ``noise_scale``."""
+        self.frames, self.poses, self.pairs = frames, poses, pairs
+        self.rows = np.flatnonzero(landmark >= 0)
+        self.landmark = landmark[self.rows]
+        self.frame = frames.frame[self.rows]
+        self.pair = pairs.of[self.rows]
+        self.c = frames.points[self.rows]
+        chol = np.linalg.cholesky(frames.covs[self.rows] * noise_scale)
+        self.whiten = np.linalg.inv(chol)  # triangular factors of well-scaled covariances
+        self.n_places = int(landmark.max(initial=-1)) + 1
+        self.keys = _Keys(len(pairs.frame), frames.n_frames, len(pairs.stretch_sigma), self.n_places)
+        self.m = len(landmark)
+
+    def residuals(self, e: Estimate) -> tuple[Array, Array]:
+        """Whitened residuals (q, 3) and predicted camera points (q, 3) of the assigned observations."""
+        R, t = e.T[self.frame, :3, :3], e.T[self.frame, :3, 3]
+        p = e.places[self.landmark] + np.where(self.pair[:, None] >= 0, e.d[self.pair], 0.0)
+        h = (np.swapaxes(R, 1, 2) @ (p - t)[..., None])[..., 0]
+        return (self.whiten @ (self.c - h)[..., None])[..., 0], h
+
+    def graph(self, e: Estimate) -> gtsam.GaussianFactorGraph:
+        """The linearised graph at an estimate; every observation weighted by its robust weight."""
+        graph = gtsam.GaussianFactorGraph()
+        self._add_poses(graph, e)
+        self._add_displacements(graph, e)
+        self._add_observations(graph, e)
+        weak = np.asfortranarray(1e-3 * np.eye(3))
+        for j in range(self.n_places):
+            graph.add(gtsam.JacobianFactor(self.keys.l + j, weak, np.zeros(3), _UNIT[3]))
+        return graph
+
+    def _add_observations(self, graph: gtsam.GaussianFactorGraph, e: Estimate) -> None:
+        r, h = self.residuals(e)
+        root = np.sqrt(e.weight[self.rows])
+        use = np.flatnonzero(root > 1e-4)
+        W = self.whiten[use] * root[use, None, None]
+        A_z = W @ np.concatenate([skew(h[use]), np.broadcast_to(-np.eye(3), (len(use), 3, 3))], axis=-1)
+        A_l = W @ np.swapaxes(e.T[self.frame[use], :3, :3], 1, 2)
+        b = r[use] * root[use, None]
+        z, l, d = self.keys.z + self.frame[use], self.keys.l + self.landmark[use], self.keys.d + self.pair[use]
+        has_pair = self.pair[use] >= 0
+        factor, unit = gtsam.JacobianFactor, _UNIT[3]
+        for k, (kz, kl, kd, pair) in enumerate(zip(z.tolist(), l.tolist(), d.tolist(), has_pair.tolist(), strict=True)):
+            if pair:
+                graph.add(factor(kz, A_z[k], kl, A_l[k], kd, A_l[k], b[k], unit))
+            else:
+                graph.add(factor(kz, A_z[k], kl, A_l[k], b[k], unit))
+
+    def _add_poses(self, graph: gtsam.GaussianFactorGraph, e: Estimate) -> None:
+        model, keys = self.poses, self.keys
+        predicted = model.given if e.X is None else model.given @ e.X
+        root = np.linalg.inv(np.linalg.cholesky(self._cov_camera(e)))
+        if model.cov_step is None:
+            error = se3_log(inverse(predicted) @ e.T)
+            A_x = -root @ adjoint(inverse(e.T) @ predicted)
+            for i in range(len(e.T)):
+                b = -root @ error[i]
+                if e.X is None:
+                    graph.add(gtsam.JacobianFactor(keys.z + i, root, b, _UNIT[6]))
+                else:
+                    graph.add(gtsam.JacobianFactor(keys.z + i, root, keys.x, A_x[i], b, _UNIT[6]))
+        else:
+            self._add_odometry(graph, e, predicted)
+        if e.X is not None and model.X0 is not None:
+            prior = np.linalg.inv(np.linalg.cholesky(model.cov_hand_eye))
+            graph.add(gtsam.JacobianFactor(keys.x, prior, -prior @ se3_log(inverse(model.X0) @ e.X), _UNIT[6]))
+
+    def _cov_camera(self, e: Estimate) -> Array:
+        if e.X is None:
+            return self.poses.cov
+        A = adjoint(inverse(e.X))
+        return A @ self.poses.cov @ A.T
+
+    def _add_odometry(self, graph: gtsam.GaussianFactorGraph, e: Estimate, predicted: Array) -> None:
+        keys, cov_step = self.keys, self.poses.cov_step
+        assert_step = cov_step if cov_step is not None else np.empty((0, 6, 6))
+        tight = 1e6 * np.eye(6)  # the first pose defines the world
+        graph.add(gtsam.JacobianFactor(keys.z, tight, -tight @ se3_log(inverse(predicted[0]) @ e.T[0]), _UNIT[6]))
+        D = inverse(predicted[:-1]) @ predicted[1:]
+        now = inverse(e.T[:-1]) @ e.T[1:]
+        error = se3_log(inverse(D) @ now)
+        A_first = -adjoint(inverse(now))
+        root = np.linalg.inv(np.linalg.cholesky(assert_step))
+        for i in range(len(D)):
+            graph.add(
+                gtsam.JacobianFactor(
+                    keys.z + i, root[i] @ A_first[i], keys.z + i + 1, root[i], -root[i] @ error[i], _UNIT[6]
+                )
+            )
+
+    def _add_displacements(self, graph: gtsam.GaussianFactorGraph, e: Estimate) -> None:
+        keys, pairs = self.keys, self.pairs
+        eye = np.eye(3)
+        for p, (sigma, s) in enumerate(zip(pairs.sigma.tolist(), pairs.stretch.tolist(), strict=True)):
+            A = eye / sigma
+            if s >= 0:
+                mean = self._stretch_mean[s] if self._stretch_mean is not None else np.zeros(3)
+                graph.add(gtsam.JacobianFactor(keys.d + p, A, keys.b + s, -A, -(e.d[p] - mean) / sigma, _UNIT[3]))
+            else:
+                graph.add(gtsam.JacobianFactor(keys.d + p, A, -e.d[p] / sigma, _UNIT[3]))
+        for s, sigma in enumerate(pairs.stretch_sigma.tolist()):
+            mean = self._stretch_mean[s] if self._stretch_mean is not None else np.zeros(3)
+            graph.add(gtsam.JacobianFactor(keys.b + s, eye / sigma, -mean / sigma, _UNIT[3]))
+
+    _stretch_mean: Array | None = None
+
+    def step(self, e: Estimate) -> tuple[Estimate, float]:
+        """One Gauss-Newton step and the size of the largest change of a place, m."""
+        delta = self.graph(e).optimize(self._ordering())
+        keys = self.keys
+        n, l, p, s = len(e.T), self.n_places, len(e.d), len(self.pairs.stretch_sigma)
+        z = np.array([delta.at(keys.z + i) for i in range(n)])
+        places = np.array([delta.at(keys.l + j) for j in range(l)]).reshape(l, 3)
+        d = np.array([delta.at(keys.d + i) for i in range(p)]).reshape(p, 3)
+        b = np.array([delta.at(keys.b + i) for i in range(s)]).reshape(s, 3)
+        self._stretch_mean = b if self._stretch_mean is None else self._stretch_mean + b
+        X = None if e.X is None else e.X @ se3_exp(delta.at(keys.x))
+        moved = replace(e, T=e.T @ se3_exp(z), X=X, places=e.places + places, d=e.d + d)
+        r, _ = self.residuals(moved)
+        chi2 = np.full(self.m, np.nan)
+        chi2[self.rows] = (r * r).sum(-1)
+        return replace(moved, residual_chi2=chi2), float(np.abs(places).max(initial=0.0))
+
+    def _ordering(self) -> gtsam.Ordering:
+        ordering = gtsam.Ordering()
+        last = self.keys.x + (0 if self.poses.X0 is None else 1)
+        for key in range(last):
+            ordering.push_back(key)
+        return ordering
+
+    def solve(self, e: Estimate, outlier_chi2: float, max_iterations: int = 8, tolerance_m: float = 2e-5) -> Estimate:
+        """Gauss-Newton with truncated least squares at ``outlier_chi2`` (3 degrees of freedom), graduated."""
+        e, _ = self.step(e)
+        worst = float(np.nanmax(e.residual_chi2, initial=1.0))
+        mu = max(1.0 / max(2.0 * worst / outlier_chi2 - 1.0, 1e-3), 0.05)
+        for _ in range(max_iterations):
+            e = replace(e, weight=_truncated_weights(e.residual_chi2, outlier_chi2, mu))
+            e, change = self.step(e)
+            if mu > 100.0 and change < tolerance_m:
+                break
+            mu *= 4.0
+        return e
+
+    def marginals(self, e: Estimate) -> Marginals:
+        """Joint covariance of places and hand-eye transform; all else is eliminated."""
+        first = gtsam.Ordering()
+        for key in range(self.keys.l):
+            first.push_back(key)
+        _, rest = self.graph(e).eliminatePartialMultifrontal(first)
+        last = gtsam.Ordering()
+        for key in range(self.keys.l, self.keys.x + (0 if e.X is None else 1)):
+            last.push_back(key)
+        H, _ = rest.hessian(last)
+        H = 0.5 * (H + H.T)
+        scale = 1.0 / np.sqrt(np.diag(H))
+        L = np.linalg.cholesky(H * scale[:, None] * scale)
+        half = np.linalg.solve(L, np.diag(scale))
+        cov = half.T @ half
+        n = 3 * self.n_places
+        return Marginals(cov[:n, :n], None if e.X is None else cov[n:, n:])
+
+
+def _truncated_weights(chi2: Array, threshold: float, mu: float) -> Array:
+    """Weights of graduated truncated least squares (Yang et al. 2020, eq. 14); unassigned observations weigh nothing."""
+    r2 = np.nan_to_num(chi2, nan=np.inf)
+    low, high = mu / (mu + 1.0) * threshold, (mu + 1.0) / mu * threshold
+    with np.errstate(invalid="ignore", divide="ignore"):
+        middle = np.sqrt(threshold * mu * (mu + 1.0) / r2) - mu
+    return np.where(r2 <= low, 1.0, np.where(r2 >= high, 0.0, np.clip(middle, 0.0, 1.0)))

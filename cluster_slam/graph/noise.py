@@ -1,0 +1,47 @@
+"""What is known of the poses of a session, as covariances of tangent vectors."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cluster_slam.geometry import Array, adjoint, inverse, se3_log
+from cluster_slam.graph.batch import PoseModel
+from cluster_slam.records import Session
+
+_LEAST_SIGMA = 1e-7  # m or rad: a pose that is stated exact still has an invertible covariance
+
+
+def pose_model(session: Session) -> PoseModel:
+    """The poses of a session with what they are stated to err."""
+    noise = session.noise
+    step = None
+    if session.pose_error == "odometry":
+        moved = se3_log(inverse(session.poses[:-1]) @ session.poses[1:])
+        turned = np.linalg.norm(moved[:, :3], axis=1)
+        travelled = np.linalg.norm(moved[:, 3:], axis=1)
+        step = _diagonal(
+            np.hypot(noise.pose_rotation, noise.odometry_rotation * turned),
+            np.hypot(noise.pose_translation, noise.odometry_translation * travelled),
+        )
+    return PoseModel(
+        given=session.poses,
+        cov=_diagonal(np.array(noise.pose_rotation), np.array(noise.pose_translation)),
+        cov_step=step,
+        X0=session.T_flange_camera,
+        cov_hand_eye=_diagonal(np.array(noise.hand_eye_rotation), np.array(noise.hand_eye_translation)),
+    )
+
+
+def camera_covs(model: PoseModel, X: Array | None) -> tuple[Array, Array | None]:
+    """Pose covariance (6, 6) and step covariances (n - 1, 6, 6) moved from the flange's frame into the camera's."""
+    if X is None:
+        return model.cov, model.cov_step
+    A = adjoint(inverse(X))
+    step = None if model.cov_step is None else A @ model.cov_step @ A.T
+    return A @ model.cov @ A.T, step
+
+
+def _diagonal(sigma_rotation: Array, sigma_translation: Array) -> Array:
+    """Diagonal covariances (..., 6, 6) with a rotation part and a translation part."""
+    sigma = np.stack([sigma_rotation] * 3 + [sigma_translation] * 3, axis=-1)
+    return np.maximum(sigma, _LEAST_SIGMA)[..., None] ** 2 * np.eye(6)
