@@ -89,9 +89,10 @@ def write_figures(
     written: list[Path] = []
     with rc_context(_STYLE):
         for kind in KINDS:
-            figure = kind.draw(result)
-            if figure is not None:
-                written += [_save(figure, out / f"{kind.name}.{suffix}", dpi) for suffix in formats]
+            for suffix in formats:  # drawn anew for each: saving a figure moves its axes a little
+                figure = kind.draw(result)
+                if figure is not None:
+                    written.append(_save(figure, out / f"{kind.name}.{suffix}", dpi))
     return tuple(written)
 
 
