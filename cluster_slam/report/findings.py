@@ -81,8 +81,7 @@ def _certainty(result: Result, summary: Summary) -> Iterator[Finding]:
     worst, typical = summary.worst_radius95_m, summary.radius95_m
     if worst is None or typical is None or worst <= _LOOSE_FACTOR * typical:
         return
-    row = int(np.searchsorted(result.clusters.ids, summary.worst_cluster or 0))
-    seen = count(int(result.clusters.n_observations[row]), "time")
+    seen = count(int((result.cluster_ids == summary.worst_cluster).sum()), "time")
     yield Finding("warn", f"Cluster {summary.worst_cluster} is known to {length(worst)} only, "
                   f"against {length(typical)} for a typical one; it was seen {seen}.")  # fmt: skip
 

@@ -63,6 +63,7 @@ def _clusters(result: Result, moved: Sway) -> list[dict[str, object]]:
     colour, spread, radius = colour_indices(clusters.positions), sigma(clusters.covs), radius95(clusters.covs)
     covs = upper(clusters.covs)
     misfit, inside = _fit(result, clusters.ids, result.cluster_ids)
+    seen = _frames_that_saw(result)
     merged = [[int(a) for a, b in result.merged if b == i] for i in clusters.ids.tolist()]
     return [
         {
@@ -76,7 +77,7 @@ def _clusters(result: Result, moved: Sway) -> list[dict[str, object]]:
             "inertia": float(clusters.descriptors[j, 0]),
             "first": float(clusters.first_seen[j] - start),
             "last": float(clusters.last_seen[j] - start),
-            "seen": int(clusters.n_observations[j]),
+            "seen": int(seen[j]),
             "state": clusters.states[j],
             "colour": int(colour[j]),
             "sway": float(moved.largest[j]),
@@ -86,6 +87,15 @@ def _clusters(result: Result, moved: Sway) -> list[dict[str, object]]:
         }
         for j in range(len(clusters))
     ]
+
+
+def _frames_that_saw(result: Result) -> IntArray:
+    """Number of frames (c,) in which at least one flower of each cluster was seen."""
+    known = np.isin(result.cluster_ids, result.clusters.ids)
+    row = np.searchsorted(result.clusters.ids, result.cluster_ids[known])
+    n = max(result.session.n_frames, 1)
+    pairs = np.unique(row * n + result.session.observations.frame[known])
+    return np.bincount(pairs // n, minlength=len(result.clusters))
 
 
 def _flowers(result: Result) -> list[dict[str, object]]:

@@ -45,9 +45,10 @@ def sentences(result: Result, summary: Summary) -> tuple[str, ...]:
         )
     if summary.n_rejected and summary.rejected:
         reason, n = summary.rejected[0]
+        most = "all" if n == summary.n_rejected else f"most often ({n:,})"
         out.append(
             f"{count(summary.n_rejected, 'detection')} ({share(summary.n_rejected, summary.n_observations)}) "
-            f"were taken for false, most often ({n:,}) because: {_lower_first(REASON_WORDS[reason].sentence)}"
+            f"were taken for false, {most} because {_lower_first(REASON_WORDS[reason].sentence)}"
         )
     if summary.hand_eye_m is not None and summary.hand_eye_rad is not None:
         out.append(
@@ -82,7 +83,7 @@ def tiles(result: Result, summary: Summary) -> tuple[Tile, ...]:
 
 def _found(summary: Summary) -> Tile:
     unsure = f", {summary.n_unsure} unconfirmed" if summary.n_unsure else ""
-    single = f" and {count(summary.n_single, 'single')}" if summary.n_single and summary.n_clusters else ""
+    single = f"and {count(summary.n_single, 'single flower')}; " if summary.n_single and summary.n_clusters else ""
     name, n = (
         ("Clusters", summary.n_clusters)
         if summary.n_clusters or not summary.n_single
@@ -90,8 +91,8 @@ def _found(summary: Summary) -> Tile:
     )
     return Tile(
         name,
-        f"{n:,}{single}",
-        f"{count(summary.n_flowers, 'flower')}{unsure}",
+        f"{n:,}",
+        f"{single}{count(summary.n_flowers, 'flower')}{' in all' if single else ''}{unsure}",
         "A cluster is a group of flowers that stand and move together.",
     )
 

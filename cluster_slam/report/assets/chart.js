@@ -122,7 +122,10 @@ const LAYERS = {
     g.stroke();
     g.setLineDash([]);
     Object.assign(g, { fillStyle: css("--soft"), textAlign: "right", textBaseline: "bottom" });
-    if (text) g.fillText(text, a.width - 12, a.y(v) - 2);
+    if (!text) return;
+    Object.assign(g, { strokeStyle: css("--card"), lineWidth: 4, lineJoin: "round" });
+    g.strokeText(text, a.width - 12, a.y(v) - 3);
+    g.fillText(text, a.width - 12, a.y(v) - 3);
   },
 };
 

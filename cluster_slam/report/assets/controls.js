@@ -4,7 +4,7 @@ const STEPS = [1, 2, 5, 10, 20, 50, 100, 200, 500];
 
 function chooseMagnify() {
   const radius = median(scene.clusters.map((c) => c.r95)) || median(scene.flowers.map((f) => CHI95 * f.sigma));
-  const spread = view.distance / 2.6;
+  const spread = view.reach;
   const wanted = radius ? (0.03 * spread) / radius : 1;
   const best = STEPS.filter((s) => s <= wanted).pop() || 1;
   byId("magnify").replaceChildren(...STEPS.map((s) => element("option", { value: s }, s === 1 ? "true size" : `${s} times`)));
@@ -18,6 +18,7 @@ function fitView(scope) {
   const plant = scene.flowers.map((f) => f.p);
   const chosen = scope === "cluster" && cluster ? cluster.flowers.map((f) => f.p) : scope === "plant" ? plant : [...plant, ...sparsePath];
   if (!chosen.length) return;
+  view.update(canvas.clientWidth, canvas.clientHeight);
   view.fit(chosen);
   if (scope === "cluster" && cluster && cluster.n === 1) view.distance = 0.3 * norm(minus(plant[0], sparsePath[0] || [0, 0, 0])) || 0.3;
   paint();

@@ -46,14 +46,27 @@ class View {
     return [Math.sqrt(Math.max(half + root, 0)), Math.sqrt(Math.max(half - root, 0)), 0.5 * Math.atan2(2 * xy, xx - yy)];
   }
 
-  // Look at points from so far that they fill the picture.
+  // Look at points so that they fill the picture from where the view stands.
   fit(points) {
+    this.enclose(points);
+    for (let i = 0; i < 4; i++) {
+      this.update(this.width, this.height);
+      const shown = points.map((p) => this.project(p)).filter(Boolean);
+      const [x, y] = [0, 1].map((k) => [Math.min(...shown.map((q) => q[k])), Math.max(...shown.map((q) => q[k]))]);
+      this.pan(this.width / 2 - (x[0] + x[1]) / 2, this.height / 2 - (y[0] + y[1]) / 2);
+      const filled = Math.max((x[1] - x[0]) / (this.width - 60), (y[1] - y[0]) / (this.height - 60), 0.05);
+      this.distance *= Math.min(1.5, Math.max(0.6, filled));
+    }
+  }
+
+  enclose(points) {
     const low = [0, 1, 2].map((i) => Math.min(...points.map((p) => p[i])));
     const high = [0, 1, 2].map((i) => Math.max(...points.map((p) => p[i])));
     this.target = low.map((v, i) => (v + high[i]) / 2);
     let radius = 0;
     for (const p of points) radius = Math.max(radius, norm(minus(p, this.target)));
-    this.distance = Math.max(radius, 1e-3) * 2.6;
+    this.reach = Math.max(radius, 1e-3);
+    this.distance = this.reach * 2.6;
   }
 
   pan(dx, dy) {

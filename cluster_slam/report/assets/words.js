@@ -58,7 +58,7 @@ function fillMisfit() {
     byId("misfit-words").textContent = "No detection was accepted, so there is nothing to compare.";
     return;
   }
-  byId("misfit-words").textContent = `Squared misfit of accepted detections (NIS over its degrees of freedom): it should be near 1 and inside the shaded band 95 % of the time; here ${(100 * m.inside).toFixed(0)} %. Above the band the map is too confident.`;
+  byId("misfit-words").textContent = `Squared misfit of accepted detections (NIS over its degrees of freedom): it should be near 1 (a little below is normal, as the map was fitted to these same detections) and inside the shaded band 95 % of the time; here ${(100 * m.inside).toFixed(0)} %. Above the band the map is too confident.`;
   const sorted = [...m.mean].sort((a, b) => a - b);
   const top = Math.max(1.6, 1.15 * sorted[Math.floor(0.98 * (sorted.length - 1))], Math.min(3, Math.max(...m.high)));
   const read = (t) => {
@@ -98,7 +98,7 @@ function fillRun() {
   const rows = [["Command", `cluster-slam ${data.command}`], ["Version", r.version], ["Seed", String(r.seed)], ["Poses given", `${r.pose_frame.replace("T_world_", "of the ")}, errors ${r.pose_error === "odometry" ? "add up (odometry)" : "each for itself"}`]];
   if (Object.keys(r.timings).length) rows.push(["Time taken", join(r.timings, seconds)]);
   if (Object.keys(r.counts).length) rows.push(["Counts", join(r.counts, whole)]);
-  if (Object.keys(r.config).length) rows.push(["Options", JSON.stringify(r.config).replaceAll(/["{}]/g, "").replaceAll(/[,:]/g, "$& ")]);
+  if (Object.keys(r.config).length) rows.push(["Options", element("details", {}, element("summary", {}, "show"), JSON.stringify(r.config).replaceAll(/["{}]/g, "").replaceAll(/[,:]/g, "$& "))]);
   byId("run").replaceChildren(...rows.map(([a, b]) => element("tr", {}, element("td", { class: "text" }, a), element("td", { class: "text" }, b))));
   byId("scores-card").hidden = !data.scores.length;
   byId("scores").replaceChildren(...data.scores.map((s) => element("tr", {}, element("td", { class: "text" }, element("span", { "data-tip": s.tip }, s.label)), element("td", {}, s.value))));
