@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from cluster_slam.cli.options import JsonOption, QuietOption
-from cluster_slam.cli.summary import print_json, print_table
-from cluster_slam.errors import InputError, OutputError
+from cluster_slam.cli.summary import print_json, print_table, print_warnings
+from cluster_slam.errors import OutputError
 
 
 def command(
@@ -29,19 +29,20 @@ def command(
     Example: cluster-slam figures out/demo -o out/figures
     """
     from cluster_slam.io.folder import check_writable
-    from cluster_slam.io.read_result import read_origin, read_result
+    from cluster_slam.io.read_result import read_origin
     from cluster_slam.io.session import open_session
     from cluster_slam.report.figures import write_figures
+    from cluster_slam.report.folder import open_result
 
     if out.resolve().is_relative_to(result.resolve()):
         raise OutputError(f"{out}: inside of the result, which is replaced as a whole, expected a folder elsewhere")
     check_writable(out)
     origin = read_origin(result)
-    folder = session or origin.session
-    if folder is None or not folder.is_dir():
-        raise InputError(f"{result / 'run.json'}: its session {folder} is missing, expected SESSION after RESULT")
-    made = read_result(result, open_session(folder, level=origin.level))
-    paths = write_figures(made, out, formats=formats.replace(" ", "").split(","), dpi=dpi)
+    folder = session or (origin.session if origin.session and origin.session.is_dir() else None)
+    opened = None if folder is None else open_session(folder, level=origin.level)
+    if opened is None and not quiet:
+        print_warnings([f"{result}: its session {origin.session} is not there, so figures lack what only it knows"])
+    paths = write_figures(open_result(result, opened), out, formats=formats.replace(" ", "").split(","), dpi=dpi)
     if as_json:
         print_json({"figures": [str(path) for path in paths]})
     elif not quiet:
