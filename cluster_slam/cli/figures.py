@@ -29,7 +29,7 @@ def command(
     Example: cluster-slam figures out/demo -o out/figures
     """
     from cluster_slam.io.folder import check_writable
-    from cluster_slam.io.read_result import read_origin
+    from cluster_slam.io.run_record import read_run
     from cluster_slam.io.session import open_session
     from cluster_slam.report.figures import write_figures
     from cluster_slam.report.folder import open_result
@@ -37,11 +37,11 @@ def command(
     if out.resolve().is_relative_to(result.resolve()):
         raise OutputError(f"{out}: inside of the result, which is replaced as a whole, expected a folder elsewhere")
     check_writable(out)
-    origin = read_origin(result)
-    folder = session or (origin.session if origin.session and origin.session.is_dir() else None)
-    opened = None if folder is None else open_session(folder, level=origin.level)
+    run = read_run(result / "run.json")
+    folder = session or (run.session_path if run.session_path and run.session_path.is_dir() else None)
+    opened = None if folder is None else open_session(folder, level=run.level)
     if opened is None and not quiet:
-        print_warnings([f"{result}: its session {origin.session} is not there, so figures lack what only it knows"])
+        print_warnings([f"{result}: its session {run.session_path} is not there, so figures lack what only it knows"])
     paths = write_figures(open_result(result, opened), out, formats=formats.replace(" ", "").split(","), dpi=dpi)
     if as_json:
         print_json({"figures": [str(path) for path in paths]})

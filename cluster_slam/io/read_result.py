@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import cast, get_args
 
 import numpy as np
 
@@ -15,7 +13,8 @@ from cluster_slam.geometry import Array, pose_from_tum
 from cluster_slam.io.flowers import POINT_COV, symmetric
 from cluster_slam.io.frames import frames_of
 from cluster_slam.io.result import CLUSTER_COLUMNS, DRIFT_COLUMNS, FLOWER_COLUMNS
-from cluster_slam.io.tables import TUM_POSE, Table, read_table, read_tum
+from cluster_slam.io.run_record import RunRecord, read_run
+from cluster_slam.io.tables import NORM_TOLERANCE, TUM_POSE, Table, read_table, read_tum
 from cluster_slam.io.text import read_text, shown
 from cluster_slam.records import (
     Calibration,
@@ -51,7 +50,7 @@ def read_result(path: str | Path, session: Session) -> Result:
     folder = Path(path)
     if not folder.is_dir():
         raise InputError(f"{folder}: {'is a file' if folder.exists() else 'missing'}, expected a result folder")
-    run = _json(folder / "run.json")
+    run = read_run(folder / "run.json")
     flower_ids, cluster_ids, diagnostics = _observations(folder / "observations.csv", session, run)
     return Result(
         session=session,
@@ -63,26 +62,15 @@ def read_result(path: str | Path, session: Session) -> Result:
         drift=_drift(folder / "drift.csv", session),
         calibration=_calibration(folder / "calibration.toml"),
         diagnostics=diagnostics,
-        command=str(run.get("command", "smooth")),
-        config=dict(run.get("config", {})),
-        seed=int(run.get("seed") or 0),
-        timings_s=dict(run.get("timings_s", {})),
-        counts=dict(run.get("counts", {})),
-        warnings=tuple(run.get("warnings", ())),
-        merged=tuple((int(a), int(b)) for a, b in run.get("merged", ())),
-        status="poor" if run.get("status") == "poor" else "ok",
+        command=run.command,
+        config=run.config,
+        seed=run.seed or 0,
+        timings_s=run.timings_s,
+        counts=run.counts,
+        warnings=run.warnings,
+        merged=run.merged,
+        status=run.status,
     )
-
-
-def _json(path: Path) -> dict[str, Any]:
-    text = read_text(path, "the record of a run (is this a result folder?)")
-    try:
-        content = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: row {error.lineno}: {error.msg}, expected JSON") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: row 1: {shown(text)}, expected an object")
-    return content
 
 
 def _trajectory(path: Path, session: Session) -> Array:
@@ -109,7 +97,7 @@ def _ints(table: Table, name: str) -> IntArray:
     return values.astype(np.int64)
 
 
-def _observations(path: Path, session: Session, run: dict[str, Any]) -> tuple[IntArray, IntArray, Diagnostics]:
+def _observations(path: Path, session: Session, run: RunRecord) -> tuple[IntArray, IntArray, Diagnostics]:
     table = read_table(path, ("timestamp", "flower_id", "cluster_id"), ("nis",), words=("reason",))
     m = len(session.observations)
     _same_length(table, m, "observations of the session")
@@ -118,7 +106,7 @@ def _observations(path: Path, session: Session, run: dict[str, Any]) -> tuple[In
     default = np.where(flowers >= 0, int(RejectReason.ACCEPTED), int(RejectReason.UNCONFIRMED)).tolist()
     reasons = [known.get(word, d) for word, d in zip(table.words.get("reason", [""] * m), default, strict=True)]
     nis = table.columns.get("nis", np.full(m, np.nan))
-    diagnostics = Diagnostics(nis, np.array(reasons, dtype=np.int64), dict(run.get("estimated_noise", {})))
+    diagnostics = Diagnostics(nis, np.array(reasons, dtype=np.int64), run.estimated_noise)
     return flowers, _ints(table, "cluster_id"), diagnostics
 
 
@@ -175,31 +163,16 @@ def _drift(path: Path, session: Session) -> Drift:
 def _calibration(path: Path) -> Calibration | None:
     if not path.exists():
         return None
+    refusal = InputError(
+        f"{path}: expected T_flange_camera (7 numbers, a unit quaternion) and covariance (6 rows of 6)"
+    )
     try:
         content = tomllib.loads(read_text(path, "a calibration"))
         T = np.array(content["T_flange_camera"], dtype=np.float64).reshape(7)
         cov = np.array(content["covariance"], dtype=np.float64).reshape(6, 6)
+        words = tuple(str(word) for word in content.get("unobserved", ()))
     except (tomllib.TOMLDecodeError, KeyError, ValueError, TypeError):
-        raise InputError(f"{path}: expected T_flange_camera (7 numbers) and covariance (6 rows of 6)") from None
-    return Calibration(pose_from_tum(T), cov, tuple(str(words) for words in content.get("unobserved", ())))
-
-
-@dataclass(frozen=True, slots=True)
-class Origin:
-    """What a result was made from; None where it does not say."""
-
-    session: Path | None
-    level: int | None
-
-
-def read_origin(path: str | Path) -> Origin:
-    """The session and the level that the result of a folder was made from.
-
-    Raises
-    ------
-    InputError
-        No result's ``run.json``.
-    """
-    run = _json(Path(path) / "run.json")
-    session, level = run.get("session_path"), run.get("level")
-    return Origin(Path(session) if isinstance(session, str) else None, level if isinstance(level, int) else None)
+        raise refusal from None
+    if not (np.isfinite(T).all() and np.isfinite(cov).all() and abs(np.linalg.norm(T[3:]) - 1) < NORM_TOLERANCE):
+        raise refusal
+    return Calibration(pose_from_tum(T), cov, words)
