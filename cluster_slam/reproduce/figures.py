@@ -23,7 +23,7 @@ PIPELINE = (
     ("detections", "pixels and depth"),
     ("flowers", "3-D points, world frame"),
     ("cluster", "inertia I,\nmean distance D"),
-    ("unscented transform", "mean and covariance\nof (I, D)"),
+    ("sigma points", "unscented transform:\nmean and covariance"),
     ("gate", "d² < χ²(0.95, 2)\nand equal counts"),
     ("match", "same cluster"),
 )

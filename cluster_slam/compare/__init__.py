@@ -1,0 +1,1 @@
+"""Descriptors held against each other."""
