@@ -17,7 +17,7 @@ from test_evaluation import made_empty
 
 from cluster_slam.evaluation import evaluate
 from cluster_slam.geometry import se3_exp
-from cluster_slam.records import Calibration, RejectReason
+from cluster_slam.records import Calibration, Observations, RejectReason
 from cluster_slam.report.colours import PALETTE, colour_indices
 from cluster_slam.report.findings import find
 from cluster_slam.report.pack import OUTSIDE, box_around, pack
@@ -170,7 +170,7 @@ def test_what_is_wrong_is_said(made: Made) -> None:
         "depth looks like millimetres",
         "scatter 2.0 times as much",
         "shift along forward",
-        "Cluster 30 and cluster 12",
+        "1 landmark was found twice",
         "of all detections were rejected",
         "Cluster 12 is known to",
         "a flower's position in one picture are 2.0 times",
@@ -240,11 +240,36 @@ def test_the_largest_session_stays_under_eight_megabytes() -> None:
     assert len(render_report(big.result, None).encode()) < 8_000_000
 
 
-@pytest.mark.parametrize("seed", [0])
-def test_empty_result_has_a_page(seed: int) -> None:
+def test_empty_result_has_a_page() -> None:
     empty = made_empty()
     page = render_report(empty.result, evaluate(empty.result, empty.session, empty.truth))
     assert "No flowers were mapped" in page
+
+
+def test_one_picture_makes_no_claims_about_fit() -> None:
+    full = make(0, n_frames=30)
+    rows = np.flatnonzero((full.session.observations.frame == 3) & (full.result.flower_ids >= 0))
+    rows = rows[np.unique(full.result.flower_ids[rows], return_index=True)[1]]
+    seen = full.session.observations
+    observations = Observations(0 * rows, seen.points[rows], seen.covs[rows], seen.scores[rows])
+    T = full.result.T_world_camera[3:4]
+    session = replace(
+        full.session, stamps=np.zeros(1), poses=T, pose_frame="T_world_camera", T_flange_camera=None,
+        observations=observations,
+    )  # fmt: skip
+    result = replace(
+        full.result, session=session, T_world_camera=T, flower_ids=full.result.flower_ids[rows],
+        cluster_ids=full.result.cluster_ids[rows], calibration=None,
+        diagnostics=replace(full.result.diagnostics, nis=np.zeros(len(rows)), reasons=0 * rows),
+        drift=replace(full.result.drift, frame=0 * full.result.drift.frame),
+    )  # fmt: skip
+    summary = summarise(result)
+    assert (summary.misfit, summary.path_shift_m, summary.hand_eye_m) == (None, None, None)
+    assert sentences(result, summary)[0].startswith("One picture was taken")
+    assert {tile["label"] for tile in page_json(result, None)["tiles"]} == {  # type: ignore[attr-defined]
+        "Clusters", "How sure is the map", "Rejected detections",
+    }  # fmt: skip
+    assert page_json(result, None)["coverage"] == []
 
 
 # in a browser

@@ -48,8 +48,9 @@ def _status(result: Result, summary: Summary) -> Iterator[Finding]:
         yield Finding("bad", "No flower was confirmed, so there is no map.")
     if summary.n_unsure:
         yield Finding("warn", f"{count(summary.n_unsure, 'cluster')} could not be confirmed and may not exist.")
-    for older, newer in result.merged[:5]:
-        yield Finding("note", f"Cluster {older} and cluster {newer} turned out to be the same and were merged.")
+    if result.merged:
+        landmarks = count(len(result.merged), "landmark was", "landmarks were")
+        yield Finding("note", f"{landmarks} found twice at first, and merged.")
 
 
 def _rejection(summary: Summary) -> Iterator[Finding]:

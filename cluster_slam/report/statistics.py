@@ -35,9 +35,9 @@ class Summary:
     radius95_m: float | None  # median over clusters of the longest half-axis of the 95 % ellipsoid
     worst_radius95_m: float | None
     worst_cluster: int | None
-    path_shift_m: float  # root mean square between given and estimated camera positions
-    path_turn_rad: float
-    misfit: float | None  # mean NIS / 3
+    path_shift_m: float | None  # root mean square between given and estimated camera positions; None where they agree
+    path_turn_rad: float | None
+    misfit: float | None  # mean NIS / 3; None where flowers were seen but once, and fit by themselves
     hand_eye_m: float | None
     hand_eye_rad: float | None
 
@@ -49,6 +49,7 @@ def summarise(result: Result) -> Summary:
     radius = radius95(result.clusters.covs)
     worst = int(radius.argmax()) if len(radius) else None
     shift = absolute_error(result.session.T_world_camera, result.T_world_camera)
+    is_moved = shift.position_m > 1e-9 or shift.rotation_rad > 1e-9
     nis = result.diagnostics.nis[np.isfinite(result.diagnostics.nis)]
     xi = hand_eye_correction(result)
     return Summary(
@@ -65,9 +66,9 @@ def summarise(result: Result) -> Summary:
         radius95_m=float(np.median(radius)) if len(radius) else None,
         worst_radius95_m=float(radius[worst]) if worst is not None else None,
         worst_cluster=int(result.clusters.ids[worst]) if worst is not None else None,
-        path_shift_m=shift.position_m,
-        path_turn_rad=shift.rotation_rad,
-        misfit=float(nis.mean() / 3.0) if len(nis) else None,
+        path_shift_m=shift.position_m if is_moved else None,
+        path_turn_rad=shift.rotation_rad if is_moved else None,
+        misfit=float(nis.mean() / 3.0) if len(nis) > len(result.flowers) else None,
         hand_eye_m=None if xi is None else float(np.linalg.norm(xi[3:])),
         hand_eye_rad=None if xi is None else float(np.linalg.norm(xi[:3])),
     )
@@ -128,7 +129,7 @@ def misfit_curve(result: Result) -> MisfitCurve:
     """NIS over time in at most 160 bins of equal length."""
     known = np.isfinite(result.diagnostics.nis)
     stamps = result.session.stamps
-    if not known.any():
+    if known.sum() <= len(result.flowers):
         return MisfitCurve(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, np.int64))
     times = (stamps - stamps[0])[result.session.observations.frame[known]]
     n_bins = max(1, min(_BINS, result.session.n_frames))
@@ -163,7 +164,7 @@ def coverage_curves(result: Result, metrics: Metrics | None) -> tuple[CoverageCu
     """Of the accepted detections, and against truth of flowers and clusters."""
     nis = result.diagnostics.nis[np.isfinite(result.diagnostics.nis)]
     curves = []
-    if len(nis):
+    if len(nis) > len(result.flowers):
         shares = tuple(float((nis <= chi2_threshold(3, p)).mean()) for p in NOMINAL)
         curves.append(_coverage_curve("detections", shares, len(nis)))
     if metrics is not None and metrics.coverage_flowers and metrics.n_flowers_compared:

@@ -34,10 +34,12 @@ def headline(summary: Summary) -> str:
 
 def sentences(result: Result, summary: Summary) -> tuple[str, ...]:
     """A short paragraph for a reader who has never seen such a page."""
+    detections = f"{count(summary.n_observations, 'detection')} of flowers"
     out = [
-        f"A camera looked at the plant for {duration(summary.seconds)} "
-        f"({count(summary.n_frames, 'picture')}, {count(summary.n_observations, 'detection')} of flowers)."
+        f"A camera looked at the plant for {duration(summary.seconds)} ({summary.n_frames:,} pictures, {detections})."
     ]
+    if summary.n_frames == 1:
+        out = [f"One picture was taken, with {detections}: nothing in it could be confirmed by a second look."]
     if summary.radius95_m is not None and summary.worst_radius95_m is not None and summary.sigma_m is not None:
         out.append(
             f"A typical cluster's centre is known to within {length(summary.radius95_m)} with 95 % probability, "
@@ -72,13 +74,7 @@ def tiles(result: Result, summary: Summary) -> tuple[Tile, ...]:
         f"{summary.n_rejected:,} of {summary.n_observations:,}",
         "Detections that were taken for false: no flower of the map caused them.",
     )
-    path = Tile(
-        "Camera path corrected by",
-        length(summary.path_shift_m),
-        f"and {angle(summary.path_turn_rad)}",
-        "Root mean square difference between the camera poses that the session gave and those that fit what was seen.",
-    )
-    return (_found(summary), certain, rejected, path, *_mount(summary), *_fit(summary))
+    return (_found(summary), certain, rejected, *_path(summary), *_mount(summary), *_fit(summary))
 
 
 def _found(summary: Summary) -> Tile:
@@ -95,6 +91,13 @@ def _found(summary: Summary) -> Tile:
         f"{single}{count(summary.n_flowers, 'flower')}{' in all' if single else ''}{unsure}",
         "A cluster is a group of flowers that stand and move together.",
     )
+
+
+def _path(summary: Summary) -> tuple[Tile, ...]:
+    if summary.path_shift_m is None or summary.path_turn_rad is None:
+        return ()
+    tip = "Root mean square difference between the camera poses that the session gave and those that fit what was seen."
+    return (Tile("Camera path corrected by", length(summary.path_shift_m), f"and {angle(summary.path_turn_rad)}", tip),)
 
 
 def _mount(summary: Summary) -> tuple[Tile, ...]:
