@@ -16,7 +16,7 @@ from tracking.consistency import mean_band
 
 Level = Literal["bad", "warn", "note"]
 
-_MUCH_REJECTED = 0.3  # share of detections, above which the detector or the result deserves a look
+MUCH_REJECTED = 0.3  # share of detections, above which the detector or the result deserves a look
 _NOISE_FACTOR = 1.25  # an estimated sigma further than this from the stated one is worth a word
 _MISFIT_SLACK = 0.2  # how far the mean misfit may be from 1 before it matters in practice
 _LOOSE_FACTOR = 5.0  # a cluster this much less certain than the typical one is named
@@ -54,7 +54,7 @@ def _status(result: Result, summary: Summary) -> Iterator[Finding]:
 
 
 def _rejection(summary: Summary) -> Iterator[Finding]:
-    if summary.n_observations and summary.n_rejected > _MUCH_REJECTED * summary.n_observations:
+    if summary.n_observations and summary.n_rejected > MUCH_REJECTED * summary.n_observations:
         part = share(summary.n_rejected, summary.n_observations)
         yield Finding("warn", f"{part} of all detections were rejected. Either the detector sees much that is not there"
                       ", or flowers were missed by the map.")  # fmt: skip

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from cluster_slam.evaluation import Metrics
 from cluster_slam.records import Result
+from cluster_slam.report.findings import MUCH_REJECTED, Level
 from cluster_slam.report.statistics import Summary
 from cluster_slam.report.words import REASON_WORDS, angle, count, digits, duration, length, share
 
@@ -18,6 +19,7 @@ class Tile:
     value: str
     detail: str
     tip: str  # what the figure means
+    level: Level | None = None  # bad or warn where the figure is a cause for concern
 
 
 def headline(summary: Summary) -> str:
@@ -73,6 +75,7 @@ def tiles(result: Result, summary: Summary) -> tuple[Tile, ...]:
         share(summary.n_rejected, summary.n_observations),
         f"{summary.n_rejected:,} of {summary.n_observations:,}",
         "Detections that were taken for false: no flower of the map caused them.",
+        "warn" if summary.n_rejected > MUCH_REJECTED * summary.n_observations else None,
     )
     return (_found(summary), certain, rejected, *_path(summary), *_mount(summary), *_fit(summary))
 
@@ -90,6 +93,7 @@ def _found(summary: Summary) -> Tile:
         f"{n:,}",
         f"{single}{count(summary.n_flowers, 'flower')}{' in all' if single else ''}{unsure}",
         "A cluster is a group of flowers that stand and move together.",
+        "bad" if not summary.n_flowers else ("warn" if summary.n_unsure else None),
     )
 
 
@@ -118,7 +122,8 @@ def _fit(summary: Summary) -> tuple[Tile, ...]:
         "Mean squared misfit of the accepted detections over what their stated certainty leads one to expect. 1: the "
         "uncertainties are true; above: too small; below: too large."
     )
-    return (Tile("Misfit against expectation", digits(summary.misfit), detail, tip),)
+    level: Level | None = None if good or summary.misfit < 1 else ("bad" if summary.misfit > 2.0 else "warn")
+    return (Tile("Misfit against expectation", digits(summary.misfit), detail, tip, level),)
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,9 +30,11 @@ REASON_WORDS = {
         "wrong layout", "The flowers of the group did not lie to each other as those of the cluster do."
     ),
     RejectReason.TAKEN: ReasonWords("taken", "Another detection of the same picture fits that flower better."),
-    RejectReason.UNCONFIRMED: ReasonWords("seen too rarely", "Seen too few times to be believed to be a flower."),
+    RejectReason.UNCONFIRMED: ReasonWords(
+        "seen too rarely", "It was seen too few times to be believed to be a flower."
+    ),
     RejectReason.OUTLIER: ReasonWords(
-        "outlier", "First matched to a flower, but inconsistent with it once everything was solved together."
+        "outlier", "It was matched to a flower at first, but did not fit once everything was solved together."
     ),
 }
 

@@ -13,9 +13,6 @@ function columns() {
     { key: "sway", head: `Moved, ${moved.unit}`, tip: "The farthest it was seen from its place at rest, where that is more than chance.", text: (c) => (c.sway ? moved.text(c.sway) : "–") },
     { key: "size", head: `Size, ${size.unit}`, tip: "Mean distance of its flowers from its centre.", text: (c) => (c.n > 1 ? size.text(c.size) : "–") },
     { key: "misfit", head: "Misfit", tip: "Mean squared misfit of its detections over what is expected: 1 is right.", text: (c) => (c.misfit === null ? "–" : c.misfit.toFixed(2)) },
-    ...(scene.clusters.some((c) => c.state !== "confirmed")
-      ? [{ key: "state", head: "State", tip: "Confirmed: seen often enough to be sure that it exists.", text: (c) => c.state }]
-      : []),
   ];
 }
 
@@ -23,12 +20,13 @@ function buildTable() {
   const made = columns();
   const heads = made.map((c) => {
     const button = element("button", { type: "button", onclick: () => sortBy(c.key) }, element("span", { "data-tip": c.tip }, c.head));
-    return element("th", { scope: "col", "data-key": c.key, class: c.key === "state" ? "text" : null }, button);
+    return element("th", { scope: "col", "data-key": c.key }, button);
   });
   const body = element("tbody");
   byId("clusters").replaceChildren(element("thead", {}, element("tr", {}, ...heads)), body);
   for (const cluster of scene.clusters) {
-    const cells = made.map((c) => element("td", { class: c.key === "state" ? "text" : null }, c.text(cluster)));
+    const cells = made.map((c) => element("td", {}, c.text(cluster)));
+    if (cluster.state !== "confirmed") cells[0].append(element("span", { class: "tag", "data-tip": "Not seen often enough to be sure that it exists." }, cluster.state));
     cells[0].prepend(element("span", { class: "dot", colour: `var(${colourOf(cluster)})` }));
     const toggle = () => change({ cluster: state.cluster === cluster.index ? null : cluster.index });
     const onkeydown = (event) => (event.key === "Enter" || event.key === " ") && (event.preventDefault(), toggle());

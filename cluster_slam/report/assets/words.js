@@ -8,7 +8,7 @@ function fillSummary() {
   if (!data.findings.some((f) => f.level !== "note")) items.unshift(element("li", { class: "good" }, element("b", {}, "Nothing. "), "No warning was raised while this map was made."));
   byId("findings").replaceChildren(...items);
   byId("tiles").replaceChildren(
-    ...data.tiles.map((t) => element("div", {}, element("dt", {}, element("span", { "data-tip": t.tip }, t.label)), element("dd", { class: "value" }, t.value), element("dd", { class: "more" }, t.detail))),
+    ...data.tiles.map((t) => element("div", { class: t.level }, element("dt", {}, element("span", { "data-tip": t.tip }, t.label)), element("dd", { class: "value" }, t.value), element("dd", { class: "more" }, t.detail))),
   );
 }
 
