@@ -76,5 +76,6 @@ def metric_rows(metrics: Mapping[str, float]) -> list[tuple[str, str]]:
 def _metric(name: str, value: float) -> tuple[str, str]:
     for ending, (factor, unit) in _LENGTHS.items():
         if name.endswith(ending):
-            return name.removesuffix(ending), f"{factor * value:.4g} {unit}"
+            what = "_rotation" if unit == "deg" and "rotation" not in name else ""
+            return name.removesuffix(ending) + what, f"{factor * value:.4g} {unit}"
     return name, f"{value:.6g}"

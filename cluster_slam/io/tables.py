@@ -135,11 +135,19 @@ def _cells(path: Path, numbered: list[tuple[int, str]], width: int) -> list[str]
     """All cells, row after row; every row has as many as the header."""
     lines = [line for _, line in numbered]
     if any('"' in line for line in lines):
-        lines = [",".join(cell.replace(",", " ") for cell in row) for row in csv.reader(lines)]
+        lines = [_unquoted(path, i, line) for i, line in numbered]
     for (i, line), commas in zip(numbered, map(str.count, lines, repeat(",")), strict=True):
         if commas != width - 1:
             raise InputError(f"{path}: row {i}: {commas + 1} values ({shown(line)}), expected {width} as in the header")
     return ",".join(lines).split(",") if lines else []
+
+
+def _unquoted(path: Path, row: int, line: str) -> str:
+    """A line whose quoted cells hold no commas any more."""
+    try:
+        return ",".join(cell.replace(",", " ").replace("\n", " ") for cell in next(csv.reader([line])))
+    except csv.Error as error:
+        raise InputError(f"{path}: row {row}: {error} ({shown(line)}), expected comma separated values") from None
 
 
 def _numbers(path: Path, name: str, rows: IntArray, cells: list[str], is_optional: bool) -> Array:
