@@ -22,7 +22,7 @@ from cluster_slam.report.colours import PALETTE, colour_indices
 from cluster_slam.report.findings import find
 from cluster_slam.report.pack import OUTSIDE, box_around, pack
 from cluster_slam.report.page import page_json, render_report
-from cluster_slam.report.statistics import hand_eye_correction, misfit_curve, radius95, sigma, summarise, sway
+from cluster_slam.report.statistics import fit_of, hand_eye_correction, misfit_curve, radius95, sigma, summarise, sway
 from cluster_slam.report.summary import headline, sentences
 from cluster_slam.report.words import angle, count, digits, duration, length, share
 
@@ -39,8 +39,10 @@ def made() -> Made:
 
 @pytest.mark.parametrize(
     ("metres", "text"),
-    [(0.0, "0 mm"), (2.34e-5, "23 µm"), (3.4e-4, "0.34 mm"), (0.013, "13 mm"), (0.234, "23 cm"), (2.34, "2.3 m"),
-     (1234.0, "1,234 m"), (float("nan"), "unknown")],
+    [
+        (0.0, "0 mm"), (2.34e-6, "2.3 µm"), (2.34e-5, "0.023 mm"), (3.4e-4, "0.34 mm"), (0.013, "13 mm"),
+        (0.234, "23 cm"), (2.34, "2.3 m"), (1234.0, "1,234 m"), (float("nan"), "unknown"),
+    ],
 )  # fmt: skip
 def test_lengths_have_a_fitting_unit(metres: float, text: str) -> None:
     assert length(metres) == text
@@ -179,6 +181,25 @@ def test_what_is_wrong_is_said(made: Made) -> None:
     assert next(iter(found.values())) == "bad"
 
 
+def test_a_cluster_of_two_is_named(made: Made) -> None:
+    nis = np.where(made.result.cluster_ids == 13, 9.0, 1.0) * made.result.diagnostics.nis
+    result = replace(made.result, diagnostics=replace(made.result.diagnostics, nis=nis))
+    text = " ".join(f.text for f in find(result, summarise(result), None))
+    assert re.search(r"Cluster 13 does not hold together: its detections scatter (2\.9|3\.0|3\.1) times", text)
+    assert text.count("does not hold together") == 1
+
+
+def test_fit_by_hand(made: Made) -> None:
+    nis = np.full(len(made.result.flower_ids), np.nan)
+    labels = np.full(len(nis), -1)
+    nis[:5], labels[:5] = [3.0, 9.0, 6.0, 1.0, np.nan], [4, 4, 7, 8, 9]
+    result = replace(made.result, diagnostics=replace(made.result.diagnostics, nis=nis))
+    fit = fit_of(result, np.array([4, 7, 9]), labels)
+    assert fit.n.tolist() == [2, 1, 0]
+    np.testing.assert_allclose(fit.misfit, [2.0, 2.0, np.nan])
+    np.testing.assert_allclose(fit.inside95, [0.5, 1.0, np.nan])
+
+
 def test_truth_speaks_up(made: Made) -> None:
     metrics = replace(
         evaluate(made.result, made.session, made.truth),
@@ -232,11 +253,13 @@ def test_many_observations_are_thinned_by_frame(made: Made, monkeypatch: pytest.
     assert scene["observations"]["every"] == 3
     kept = scene["observations"]["flower"]["s"][0]
     assert kept == (made.session.observations.frame % 3 == 0).sum()
+    assert scene["drift"]["frame"]["s"][0] == (made.result.drift.frame % 3 == 0).sum()
 
 
 def test_the_largest_session_stays_under_eight_megabytes() -> None:
-    big = make(2, n_frames=5000, n_clusters=18)
-    assert len(big.session.observations) > 300_000
+    big = make(2, n_frames=12_000, n_clusters=12)
+    assert len(big.session.observations) > 500_000
+    assert len(big.result.drift.frame) > 120_000
     assert len(render_report(big.result, None).encode()) < 8_000_000
 
 
@@ -328,6 +351,20 @@ def test_slider_shows_what_was_seen(page: Browser, made: Made, tmp_path: Path) -
     assert page.value("flowerReport.state.frame") == frame + 1
     page.click_on("#whole")
     assert page.value("flowerReport.state.frame") is None
+    assert page.problems == []
+
+
+@needs_browser
+def test_slider_of_a_thinned_session(
+    page: Browser, made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cluster_slam.report.scene.MAX_OBSERVATIONS", int(len(made.session.observations) / 3.5))
+    page.open(put(tmp_path, made))
+    page.click_on("#slider")
+    frame = page.value("flowerReport.state.frame")
+    assert frame % 4 == 0
+    seen = made.result.flower_ids[made.session.observations.frame == frame]
+    assert f"The camera sees {(seen >= 0).sum()} flowers" in page.value("document.getElementById('now').textContent")
     assert page.problems == []
 
 

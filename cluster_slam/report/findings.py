@@ -10,7 +10,7 @@ import numpy as np
 
 from cluster_slam.evaluation import Metrics
 from cluster_slam.records import Result
-from cluster_slam.report.statistics import Summary
+from cluster_slam.report.statistics import Summary, fit_of
 from cluster_slam.report.words import count, digits, length, share
 from tracking.consistency import mean_band
 
@@ -19,6 +19,8 @@ Level = Literal["bad", "warn", "note"]
 MUCH_REJECTED = 0.3  # share of detections, above which the detector or the result deserves a look
 _NOISE_FACTOR = 1.25  # an estimated sigma further than this from the stated one is worth a word
 _MISFIT_SLACK = 0.2  # how far the mean misfit may be from 1 before it matters in practice
+_LOOSE_MISFIT = 2.0  # a cluster whose misfit is this many times the typical one is named
+_ENOUGH = 20  # detections, from which a cluster's misfit says anything
 _LOOSE_FACTOR = 5.0  # a cluster this much less certain than the typical one is named
 
 
@@ -32,9 +34,17 @@ class Finding:
 
 def find(result: Result, summary: Summary, metrics: Metrics | None) -> tuple[Finding, ...]:
     """All that is worth a warning, worst first."""
-    parts = (_status(result, summary), _rejection(summary), _consistency(result, summary), _certainty(result, summary))
+    parts = (
+        _status(result, summary),
+        _rejection(summary),
+        _consistency(result, summary),
+        _loose_clusters(result),
+        _certainty(result, summary),
+        _calibration(result),
+        _noise(result),
+        _against_truth(metrics),
+    )
     found = [finding for part in parts for finding in part]
-    found += list(_calibration(result)) + list(_noise(result)) + list(_against_truth(metrics))
     known = {finding.text for finding in found}
     found += [Finding("warn", text) for text in (*result.session.warnings, *result.warnings) if text not in known]
     order: list[Level] = ["bad", "warn", "note"]
@@ -76,6 +86,16 @@ def _consistency(result: Result, summary: Summary) -> Iterator[Finding]:
         times = digits(float(1.0 / np.sqrt(summary.misfit)))
         yield Finding("note", f"Detections scatter {times} times less than the program accounts for: "
                       "the map is better than it says.")  # fmt: skip
+
+
+def _loose_clusters(result: Result) -> Iterator[Finding]:
+    fit = fit_of(result, result.clusters.ids, result.cluster_ids)
+    typical = float(np.nanmedian(fit.misfit)) if fit.n.any() else 1.0
+    loose = np.flatnonzero((fit.misfit > _LOOSE_MISFIT * max(typical, 1.0)) & (fit.n >= _ENOUGH))
+    for j in loose[np.argsort(-fit.misfit[loose], kind="stable")][:3]:
+        times = digits(float(np.sqrt(fit.misfit[j] / max(typical, 1.0))))
+        text = f"Cluster {result.clusters.ids[j]} does not hold together: its detections scatter {times} times as much"
+        yield Finding("warn", f"{text} as those of others. It may be two clusters taken for one.")
 
 
 def _certainty(result: Result, summary: Summary) -> Iterator[Finding]:

@@ -49,7 +49,7 @@ def render_report(result: Result, metrics: Metrics | None = None) -> str:
     Notes
     -----
     The page opens from disk, loads nothing (a content security policy forbids it), and stays under 8 MB: of more
-    than 300,000 observations only every second (third ...) frame's are shown.
+    than 300,000 observations only those of every second (third ...) frame are in it.
     """
     parts = {
         "title": html.escape(f"{result.session.id}: flower map"),

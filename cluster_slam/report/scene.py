@@ -12,10 +12,11 @@ from cluster_slam.geometry import Array, quaternion_from_rotation
 from cluster_slam.records import CLUTTER, IntArray, Result
 from cluster_slam.report.colours import colour_indices
 from cluster_slam.report.pack import box_around, pack, rounded, upper
-from cluster_slam.report.statistics import Sway, radius95, sigma, sway, world_points
+from cluster_slam.report.statistics import Sway, fit_of, radius95, sigma, sway, world_points
 
 NONE = 65535
 MAX_OBSERVATIONS = 300_000  # in the page; of more, every second (third ...) frame's are kept
+MAX_DRIFT = 120_000  # rows of the drift table, likewise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +44,7 @@ def scene_json(result: Result) -> dict[str, object]:
         "box": box.as_json(),
         "clusters": _clusters(result, moved),
         "flowers": _flowers(result),
-        "drift": _drift(result, moved),
+        "drift": _drift(result, moved, seen.every),
         "observations": _observations(result, seen, points, box.steps(points[seen.rows])),
     }
 
@@ -62,7 +63,7 @@ def _clusters(result: Result, moved: Sway) -> list[dict[str, object]]:
     start = result.session.stamps[0] if len(result.session.stamps) else 0.0
     colour, spread, radius = colour_indices(clusters.positions), sigma(clusters.covs), radius95(clusters.covs)
     covs = upper(clusters.covs)
-    misfit, inside = _fit(result, clusters.ids, result.cluster_ids)
+    fit = fit_of(result, clusters.ids, result.cluster_ids)
     seen = _frames_that_saw(result)
     merged = [[int(a) for a, b in result.merged if b == i] for i in clusters.ids.tolist()]
     return [
@@ -81,8 +82,8 @@ def _clusters(result: Result, moved: Sway) -> list[dict[str, object]]:
             "state": clusters.states[j],
             "colour": int(colour[j]),
             "sway": float(moved.largest[j]),
-            "misfit": _or_none(misfit[j]),
-            "inside": _or_none(inside[j]),
+            "misfit": _or_none(fit.misfit[j]),
+            "inside": _or_none(fit.inside95[j]),
             "merged": merged[j],
         }
         for j in range(len(clusters))
@@ -103,7 +104,7 @@ def _flowers(result: Result) -> list[dict[str, object]]:
     start = result.session.stamps[0] if len(result.session.stamps) else 0.0
     spread, covs = sigma(flowers.covs), upper(flowers.covs)
     cluster = np.searchsorted(result.clusters.ids, flowers.cluster_ids)
-    misfit, _ = _fit(result, flowers.ids, result.flower_ids)
+    fit = fit_of(result, flowers.ids, result.flower_ids)
     return [
         {
             "id": int(flowers.ids[i]),
@@ -114,30 +115,20 @@ def _flowers(result: Result) -> list[dict[str, object]]:
             "first": float(flowers.first_seen[i] - start),
             "last": float(flowers.last_seen[i] - start),
             "seen": int(flowers.n_observations[i]),
-            "misfit": _or_none(misfit[i]),
+            "misfit": _or_none(fit.misfit[i]),
         }
         for i in range(len(flowers))
     ]
 
 
-def _fit(result: Result, ids: IntArray, labels: IntArray) -> tuple[Array, Array]:
-    """Mean NIS / 3 of each id's observations, and the share inside the 95 % gate; NaN where there are none."""
-    nis = result.diagnostics.nis
-    rows = np.isfinite(nis) & np.isin(labels, ids)
-    where = np.searchsorted(ids, labels[rows])
-    n = np.bincount(where, minlength=len(ids)).astype(np.float64)
-    n[n == 0] = np.nan
-    total = np.bincount(where, weights=nis[rows], minlength=len(ids))
-    inside = np.bincount(where, weights=nis[rows] <= 7.8147, minlength=len(ids))
-    return total / n / 3.0, inside / n
-
-
-def _drift(result: Result, moved: Sway) -> dict[str, object]:
+def _drift(result: Result, moved: Sway, every: int) -> dict[str, object]:
     known = np.isin(result.drift.cluster_ids, result.clusters.ids)
-    order = np.lexsort((result.drift.frame[known], moved.cluster))
+    frame = result.drift.frame[known]
+    order = np.lexsort((frame, moved.cluster))
+    order = order[frame[order] % every == 0]
     step = max(float(np.abs(moved.displacement).max(initial=0.0)), 1e-6) / 32000
     return {
-        "frame": pack(result.drift.frame[known][order], "u4"),
+        "frame": pack(frame[order], "u4"),
         "cluster": pack(moved.cluster[order], "u2"),
         "d": pack(np.round(moved.displacement[order] / step), "i2"),
         "step": step,
@@ -147,7 +138,7 @@ def _drift(result: Result, moved: Sway) -> dict[str, object]:
 
 def _kept(result: Result) -> _Seen:
     frame = result.session.observations.frame
-    every = max(1, -(-len(frame) // MAX_OBSERVATIONS))
+    every = max(1, -(-len(frame) // MAX_OBSERVATIONS), -(-len(result.drift.frame) // MAX_DRIFT))
     rows = np.flatnonzero(frame % every == 0)
     return _Seen(rows[np.argsort(frame[rows], kind="stable")], every)
 

@@ -110,6 +110,27 @@ def _rejections(result: Result) -> tuple[tuple[RejectReason, int], ...]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """How well the observations of each of some landmarks fit."""
+
+    n: IntArray  # (l,) observations with a known misfit
+    misfit: Array  # (l,) mean NIS / 3; NaN where n is 0
+    inside95: Array  # (l,) share inside the 95 % gate; NaN where n is 0
+
+
+def fit_of(result: Result, ids: IntArray, labels: IntArray) -> Fit:
+    """Fit of the landmarks of increasing ids (l,) by the labels (m,) of the observations."""
+    nis = result.diagnostics.nis
+    rows = np.isfinite(nis) & np.isin(labels, ids)
+    where = np.searchsorted(ids, labels[rows])
+    n = np.bincount(where, minlength=len(ids))
+    total = np.bincount(where, weights=nis[rows], minlength=len(ids))
+    inside = np.bincount(where[nis[rows] <= chi2_threshold(3, 0.95)], minlength=len(ids))
+    known = np.where(n > 0, n, np.nan)
+    return Fit(n, np.asarray(total / known / 3.0), np.asarray(inside / known))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class MisfitCurve:
     """Mean NIS of accepted observations over time, and the band that holds 95 % of such means if all is true."""
 

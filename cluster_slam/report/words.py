@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from cluster_slam.records import RejectReason
 
-_STEPS = ((1e-4, 1e6, "µm"), (0.1, 1e3, "mm"), (1.0, 1e2, "cm"))
+_STEPS = ((1e-5, 1e6, "µm"), (0.1, 1e3, "mm"), (1.0, 1e2, "cm"))
 
 
 @dataclass(frozen=True, slots=True)

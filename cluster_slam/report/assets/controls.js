@@ -73,8 +73,8 @@ function play(before) {
   const speed = Math.max(1, (scene.stamps[nFrames - 1] || 1) / 60);
   const at = scene.stamps[state.frame ?? 0] + passed * speed;
   let frame = state.frame ?? 0;
-  while (frame < nFrames - 1 && scene.stamps[frame + 1] <= at) frame++;
-  if (frame === nFrames - 1) change({ frame, playing: false });
+  while (frame + every < nFrames && scene.stamps[frame + every] <= at) frame += every;
+  if (frame + every >= nFrames) change({ frame, playing: false });
   else if (frame !== state.frame) change({ frame });
   const next = frame === state.lastPlayed ? before : now;
   state.lastPlayed = frame;

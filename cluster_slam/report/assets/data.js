@@ -53,8 +53,10 @@ function frameOf(k) {
   return low;
 }
 
+const { every } = scene.observations; // of a long session only each so manieth frame is in the page
+
 function nearestFrame(time) {
   let best = 0;
-  for (let k = 1; k < nFrames; k++) if (Math.abs(scene.stamps[k] - time) < Math.abs(scene.stamps[best] - time)) best = k;
+  for (let k = every; k < nFrames; k += every) if (Math.abs(scene.stamps[k] - time) < Math.abs(scene.stamps[best] - time)) best = k;
   return best;
 }

@@ -39,7 +39,7 @@ function facts(cluster, seen) {
   ];
   if (cluster.merged.length) items.push(`Absorbed cluster ${cluster.merged.join(", ")}, which turned out to be the same.`);
   if (cluster.state !== "confirmed") items.push(`It is ${cluster.state}: not seen often enough to be sure.`);
-  if (scene.observations.every > 1) items.push(`Counts of detections: every ${scene.observations.every}th picture only.`);
+  if (every > 1) items.push(`The session is long: of its pictures, one in ${every} is counted and drawn here.`);
   return [element("h3", {}, "In words"), element("ul", { class: "facts" }, ...items.map((text) => element("li", {}, text)))];
 }
 

@@ -60,9 +60,9 @@ function paintFloor() {
   for (let b = low[1]; b <= high[1] + 1e-9; b += floorStep) line([corner(low[0], b), corner(high[0], b)], faint, 0.6);
 }
 
-const every = Math.max(1, Math.floor(nFrames / 60));
+const stride = Math.max(1, Math.floor(nFrames / 60));
 const sparsePath = [];
-for (let k = 0; k < nFrames; k += every) sparsePath.push(row(scene.after, k));
+for (let k = 0; k < nFrames; k += stride) sparsePath.push(row(scene.after, k));
 
 // The path as given is drawn off the estimated one by the magnified difference.
 function givenPoint(k) {

@@ -39,11 +39,12 @@ function start() {
   fillCalibration();
   fillRun();
   buildTable();
+  slider.step = every;
   slider.max = Math.max(0, nFrames - 1);
   slider.addEventListener("input", () => change({ frame: Number(slider.value), playing: false }));
   byId("whole").addEventListener("click", () => change({ frame: null, playing: false }));
   byId("play").addEventListener("click", () => {
-    const again = state.frame === null || state.frame === nFrames - 1;
+    const again = state.frame === null || state.frame + every >= nFrames;
     change({ playing: !state.playing, frame: again && !state.playing ? 0 : state.frame });
     play();
   });

@@ -25,7 +25,7 @@ function buildTable() {
   const body = element("tbody");
   byId("clusters").replaceChildren(element("thead", {}, element("tr", {}, ...heads)), body);
   for (const cluster of scene.clusters) {
-    const cells = made.map((c) => element("td", {}, c.text(cluster)));
+    const cells = made.map((c) => element("td", { class: c.key === "misfit" && cluster.misfit > 2 ? "doubt" : null }, c.text(cluster)));
     if (cluster.state !== "confirmed") cells[0].append(element("span", { class: "tag", "data-tip": "Not seen often enough to be sure that it exists." }, cluster.state));
     cells[0].prepend(element("span", { class: "dot", colour: `var(${colourOf(cluster)})` }));
     const toggle = () => change({ cluster: state.cluster === cluster.index ? null : cluster.index });
