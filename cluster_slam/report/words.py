@@ -43,7 +43,7 @@ def length(metres: float) -> str:
     """A length with two digits in a fitting unit: ``0.34 mm``, ``13 cm``, ``2.3 m``."""
     if not math.isfinite(metres):
         return "unknown"
-    if metres == 0:
+    if abs(metres) < 1e-9:
         return "0 mm"
     factor, unit = next(((f, u) for below, f, u in _STEPS if abs(metres) < below), (1.0, "m"))
     return f"{digits(metres * factor)} {unit}"

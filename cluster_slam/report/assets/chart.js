@@ -90,12 +90,15 @@ function rule(g, x, y0, y1, colour) {
 const clip = (a, v) => a.y(Math.min(a.y1, Math.max(a.y0, v)));
 
 const LAYERS = {
-  band(g, a, { t, low, high }) {
-    g.beginPath();
-    for (let i = 0; i < t.length; i++) g.lineTo(a.x(t[i]), clip(a, high[i]));
-    for (let i = t.length - 1; i >= 0; i--) g.lineTo(a.x(t[i]), clip(a, low[i]));
+  band(g, a, { t, low, high, gap }) {
     g.fillStyle = css("--band");
-    g.fill();
+    for (let start = 0, end = 1; start < t.length; start = end++) {
+      while (end < t.length && t[end] - t[end - 1] <= (gap || Infinity)) end++;
+      g.beginPath();
+      for (let i = start; i < end; i++) g.lineTo(a.x(t[i]), clip(a, high[i]));
+      for (let i = end - 1; i >= start; i--) g.lineTo(a.x(t[i]), clip(a, low[i]));
+      g.fill();
+    }
   },
   line(g, a, { t, v, colour, gap, dash }) {
     g.setLineDash(dash || []);

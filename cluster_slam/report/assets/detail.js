@@ -89,7 +89,13 @@ function swayChart(cluster) {
     const i = nearest(t, time);
     return i < 0 ? null : `${seconds(t[i])}: ${length(v[i])} from rest (chance alone: up to ${length(noise[i] / factor)})`;
   };
-  const layers = [{ kind: "band", t, low: noise.map(() => 0), high: noise }, { kind: "line", t, v: scaled, colour: colourOf(cluster), gap: 1 }];
+  const steps = t.slice(1).map((time, i) => time - t[i]);
+  const gap = Math.max(1, 5 * median(steps));
+  const layers = [
+    { kind: "band", t, low: noise.map(() => 0), high: noise, gap },
+    { kind: "line", t, v: scaled, colour: colourOf(cluster), gap },
+    { kind: "dots", t, v: scaled, colour: colourOf(cluster), size: 0.8 },
+  ];
   return { title: `Sway: distance from its place at rest, ${unit} (shaded: what chance alone explains)`, box: element("div", { class: "chart" }), spec: { range: [0, top], layers, read, unit, label: "Sway over time" } };
 }
 

@@ -9,7 +9,7 @@ function digits(value) {
 
 function unitOf(metres) {
   const size = Math.abs(metres);
-  if (size < 1e-5 && size > 0) return [1e6, "µm"];
+  if (size < 1e-5 && size > 1e-9) return [1e6, "µm"];
   if (size < 0.1) return [1e3, "mm"];
   return size < 1 ? [100, "cm"] : [1, "m"];
 }

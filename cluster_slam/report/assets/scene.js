@@ -138,9 +138,10 @@ function paintLabels() {
   pen.font = "600 12px system-ui, sans-serif";
   pen.textAlign = "center";
   const crowded = scene.clusters.length > 60;
+  const allSingle = scene.clusters.every((c) => c.n === 1);
   for (const cluster of scene.clusters) {
     const chosen = state.cluster === cluster.index;
-    if ((crowded || cluster.n === 1) && !chosen && state.hover !== cluster.index) continue;
+    if ((crowded || (cluster.n === 1 && !allSingle)) && !chosen && state.hover !== cluster.index) continue;
     const q = view.project(cluster.p);
     if (!q) continue;
     const y = q[1] - 9;
