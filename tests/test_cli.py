@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -29,7 +29,7 @@ from cluster_slam.simulate.config import SimulateConfig
 
 MADE = make(3, n_frames=60)
 HEAVY = ["numpy", "scipy", "gtsam", "cv2", "plotly", "matplotlib", "filterpy", "onnxruntime", "sqlite3"]
-COMMANDS = ["smooth", "simulate", "evaluate", "check", "figures"]
+COMMANDS = ["smooth", "simulate", "evaluate", "check", "figures", "reproduce paper"]
 Smooth = Callable[..., Result]
 
 
@@ -66,7 +66,7 @@ def test_nothing_heavy_is_imported() -> None:
     assert done.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)], ids=["all", *COMMANDS])
+@pytest.mark.parametrize("command", [[], *(name.split() for name in COMMANDS)], ids=["all", *COMMANDS])
 def test_help_imports_nothing_heavy(command: list[str]) -> None:
     code = f"""
 import sys
@@ -268,6 +268,21 @@ def test_figures_find_the_session_by_themselves(
     session.rename(tmp_path / "moved")
     assert run(["figures", str(out), "-o", str(tmp_path / "more"), "--formats", "svg"]) == 0
     assert "is not there, so figures lack" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("is_exact", "alpha", "code"), [(True, 1.0, 0), (False, 1.0, 1), (False, 0.5, 0)])
+def test_reproduce_says_whether_the_table_is_exact(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], is_exact: bool, alpha: float, code: int
+) -> None:
+    def reproduce(out: Path, **options: Any) -> SimpleNamespace:
+        assert (options["alpha"], options["noise"]) == (alpha, 0.01)
+        return SimpleNamespace(is_table1_exact=is_exact, settings=SimpleNamespace(is_paper=alpha == 1.0))
+
+    monkeypatch.setattr("cluster_slam.reproduce.paper.reproduce_paper", reproduce)
+    assert run(["reproduce", "paper", "-o", "x", "--alpha", str(alpha), "--json"]) == code
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == {"out": "x", "is_table1_exact": is_exact}
+    assert ("not as printed" in printed.err) == (code == 1)
 
 
 def test_check_says_what_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

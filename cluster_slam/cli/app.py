@@ -12,7 +12,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from cluster_slam import __version__
-from cluster_slam.cli import check, evaluate, figures, simulate, smooth
+from cluster_slam.cli import check, evaluate, figures, reproduce, simulate, smooth
 from cluster_slam.errors import ClusterSlamError
 
 EXIT_POOR = 1  # it ran, but the result is poor
@@ -53,6 +53,7 @@ app.command("simulate")(simulate.command)
 app.command("evaluate")(evaluate.command)
 app.command("check")(check.command)
 app.command("figures")(figures.command)
+app.add_typer(reproduce.app, name="reproduce")
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
