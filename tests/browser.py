@@ -5,9 +5,11 @@ from __future__ import annotations
 import base64
 import json
 import os
+import select
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -27,6 +29,12 @@ FLAGS = [
     ),
     *("--host-resolver-rules=MAP * ~NOTFOUND", "--remote-debugging-pipe"),
 ]
+
+PLACE = (  # puts the pipe's ends where the browser looks for them, and becomes the browser
+    "import os, sys; r, w = (os.dup(int(a)) for a in sys.argv[1:3]); r, w = os.dup2(r, 40), os.dup2(w, 41);"
+    " os.dup2(r, 3); os.dup2(w, 4); os.execv(sys.argv[3], sys.argv[3:])"
+)
+ANSWER_S = 60.0  # longer than any answer takes on a busy machine
 
 
 @dataclass
@@ -59,6 +67,8 @@ class Browser:
 
     def _read(self) -> None:
         while b"\0" not in self._buffer:
+            if not select.select([self.inp], [], [], ANSWER_S)[0]:
+                raise TimeoutError(f"the browser said nothing for {ANSWER_S} s")
             chunk = os.read(self.inp, 1 << 20)
             if not chunk:
                 raise RuntimeError("the browser closed its pipe")
@@ -146,21 +156,26 @@ def browser() -> Iterator[Browser]:
     if CHROMIUM is None:
         raise RuntimeError("no Chromium on this machine")
     to_read, to_write = os.pipe(), os.pipe()
-
-    def place() -> None:
-        os.dup2(to_read[0], 200), os.dup2(to_write[1], 201)
-        os.dup2(200, 3), os.dup2(201, 4)
+    ends = (to_read[0], to_write[1])
 
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         process = subprocess.Popen(
-            [CHROMIUM, *FLAGS, f"--user-data-dir={profile}", "about:blank"],
-            preexec_fn=place,
-            pass_fds=(3, 4),
+            [
+                sys.executable,
+                "-c",
+                PLACE,
+                *map(str, ends),
+                CHROMIUM,
+                *FLAGS,
+                f"--user-data-dir={profile}",
+                "about:blank",
+            ],
+            pass_fds=ends,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,
         )
-        os.close(to_read[0]), os.close(to_write[1])
+        os.close(ends[0]), os.close(ends[1])
         made = Browser(to_read[1], to_write[0])
         try:
             target = made.call("Target.createTarget", url="about:blank")["targetId"]

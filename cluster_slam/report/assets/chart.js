@@ -28,7 +28,7 @@ function ticks(low, high, wanted) {
 function axes(made) {
   const { spec, node, height } = made;
   const width = node.clientWidth || 300;
-  const left = spec.left || 46;
+  const left = spec.left || 62;
   const [t0, t1] = spec.domain || [0, Math.max(scene.stamps[nFrames - 1] || 0, 1e-3)];
   const [y0, y1] = spec.range;
   const x = (t) => left + ((t - t0) / (t1 - t0)) * (width - left - 10);
