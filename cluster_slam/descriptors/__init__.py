@@ -1,7 +1,9 @@
 """What a cluster looks like wherever it stands: descriptors with mean, covariance and degrees of freedom."""
 
 from cluster_slam.descriptors.background import Background
-from cluster_slam.descriptors.geometry import GeometryMatch, GeometryMatches, match_geometries, match_geometry
+from cluster_slam.descriptors.calibration import calibrated_threshold
+from cluster_slam.descriptors.geometries import GeometryMatches, match_geometries
+from cluster_slam.descriptors.geometry import GeometryMatch, match_geometry
 from cluster_slam.descriptors.invariants import (
     InertiaDistance,
     UnscentedDescriptor,
@@ -41,6 +43,7 @@ __all__ = [
     "InertiaDistance",
     "UnscentedDescriptor",
     "block_diagonal",
+    "calibrated_threshold",
     "checked_points",
     "closed_form_moments",
     "compare_vectors",

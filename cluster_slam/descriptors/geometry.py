@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cluster_slam.descriptors.alignment import Aligned, align, align_isotropic
-from cluster_slam.descriptors.members import centred_cov, checked_points, checked_sigma
+from cluster_slam.descriptors.members import centred_cov, checked_points
 from cluster_slam.descriptors.search import MISSED, Maps, search_maps
 from cluster_slam.errors import InputError
 from cluster_slam.geometry import Array, inverse
@@ -34,16 +34,6 @@ class GeometryMatch:
     observed: IntArray  # (k,) their partners
     T_observed_reference: Array  # (4, 4) takes reference points onto observed ones
     runner_up_sq: float  # no other map found within the limit costs less; inf where there is no other
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GeometryMatches:
-    """The same for p pairs of clusters; as `GeometryMatch`, without the maps."""
-
-    distance_sq: Array  # (p,)
-    dof: Array  # (p,) NaN where there is no match
-    log_likelihood: Array  # (p,)
-    runner_up_sq: Array  # (p,)
 
 
 NO_MATCH = GeometryMatch(np.inf, 0, -np.inf, np.zeros(0, np.int64), np.zeros(0, np.int64), np.eye(4), np.inf)
@@ -86,48 +76,13 @@ def match_geometry(
     if len(a) > len(b) and not np.isfinite(missed_cost):
         return _turned(match_geometry(b, cov_b, a, cov_a, missed_cost=missed_cost, limit=limit))
     var, alone = _largest_var(cov_a) + _largest_var(cov_b), (len(a) + len(b)) * missed_cost
-    current = min(alone, _first_limit(len(a), len(b), missed_cost) if limit is None else limit)
+    current = min(alone, first_limit(len(a), len(b), missed_cost) if limit is None else limit)
     while True:
         maps = search_maps(a[None], b[None], np.array([var]), np.array([current]), missed_cost)
         best = _best(maps, a, cov_a, b, cov_b, missed_cost, current)
         if limit is not None or np.isfinite(best.distance_sq) or current >= alone or not np.isfinite(current):
             return best
         current = min(alone, current * WIDER)
-
-
-def match_geometries(
-    reference: Array, observed: Array, sigma: Array | float, limit: Array | float = np.inf
-) -> GeometryMatches:
-    """Match many pairs of clusters at once, members with equal isotropic errors; the smaller is matched whole.
-
-    Parameters
-    ----------
-    reference, observed
-        (p, n, 3) and (p, m, 3), m.
-    sigma
-        (p,) or one number: standard deviation of a residual along each axis, hypot of both sides' sigmas, m.
-    limit
-        (p,) or one number: squared distances above it are not looked for. Infinite: every map is weighed.
-    """
-    a, b = checked_points(reference), checked_points(observed)
-    if a.shape[1] > b.shape[1]:
-        turned = match_geometries(b, a, sigma, limit)
-        return GeometryMatches(turned.distance_sq, turned.dof, turned.log_likelihood, turned.runner_up_sq)
-    var = np.broadcast_to(checked_sigma(sigma) ** 2, len(a))
-    maps = search_maps(a, b, var, np.broadcast_to(np.asarray(limit, float), len(a)))
-    pair, first = np.unique(maps.pair, return_index=True)
-    best = maps.partner[first]
-    aligned = align_isotropic(a[pair], np.take_along_axis(b[pair], best[..., None], axis=1), var[pair])
-    out = GeometryMatches(*(np.full(len(a), v) for v in (np.inf, np.nan, -np.inf, np.inf)))
-    out.distance_sq[pair], out.dof[pair], out.log_likelihood[pair] = (
-        aligned.distance_sq,
-        aligned.dof,
-        aligned.log_likelihood,
-    )
-    second = np.minimum(first + 1, len(maps.pair) - 1)
-    has_second = maps.pair[second] == pair
-    out.runner_up_sq[pair[has_second & (second > first)]] = maps.bound[second[has_second & (second > first)]]
-    return out
 
 
 def _best(
@@ -185,7 +140,8 @@ def _largest_var(cov: Array) -> float:
     return float(np.linalg.eigvalsh(centred_cov(cov))[-1])
 
 
-def _first_limit(n: int, m: int, missed_cost: float) -> float:
+def first_limit(n: int, m: int, missed_cost: float = np.inf) -> float:
+    """Where the search for the best map begins."""
     forced = abs(n - m) * missed_cost if np.isfinite(missed_cost) else 0.0
     return chi2_threshold(max(3 * min(n, m) - 6, 1), FIRST_LIMIT) + forced
 

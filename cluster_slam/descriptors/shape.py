@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cluster_slam.descriptors.geometry import match_geometries, match_geometry
+from cluster_slam.descriptors.geometries import match_geometries
+from cluster_slam.descriptors.geometry import match_geometry
 from cluster_slam.descriptors.invariants import common_variance
 from cluster_slam.descriptors.members import centred, checked_points
 from cluster_slam.descriptors.protocol import Comparison, Description
@@ -46,8 +47,7 @@ class FullGeometry:
         return Comparison(*(x.reshape(shape) for x in found))
 
     def _compare_isotropic(self, a: Array, b: Array, sigma: Array) -> tuple[Array, Array, Array]:
-        limit = np.inf if self.limit is None else self.limit
-        match = match_geometries(a, b, sigma, limit)
+        match = match_geometries(a, b, sigma, self.limit)
         return match.distance_sq, match.dof, match.log_likelihood
 
     def _compare_one_by_one(self, a: Array, cov_a: Array, b: Array, cov_b: Array) -> tuple[Array, Array, Array]:
