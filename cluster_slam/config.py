@@ -18,8 +18,7 @@ class GroupingConfig:
 
     method: GroupingMethod = "spacing"  # average linkage on distance and common motion
     n_clusters: int | None = None  # for "kmeans"
-    linkage_m: float | None = None  # cut of the linkage; None: linkage_per_spacing
-    linkage_per_spacing: float = 3.7  # cut as a multiple of the median distance of a flower to its nearest
+    linkage_m: float | None = None  # where the linkage tree is cut; None: the likeliest cut
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from scipy.cluster.vq import kmeans2
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import squareform
+from scipy.special import gammaln
 
 from cluster_slam.config import GroupingConfig
 from cluster_slam.errors import ConfigError
@@ -28,7 +29,13 @@ class Motion:
 
 
 def group_flowers(
-    places: Array, presence: csr_matrix, motion: Motion | None, config: GroupingConfig, *, rng: np.random.Generator
+    places: Array,
+    presence: csr_matrix,
+    motion: Motion | None,
+    view_volume: float,
+    config: GroupingConfig,
+    *,
+    rng: np.random.Generator,
 ) -> IntArray:
     """Cluster 0..c-1 of each flower (l,).
 
@@ -37,6 +44,7 @@ def group_flowers(
     places : (l, 3) at rest, m.
     presence : (l, n) which frames saw each flower.
     motion : what is known of the flowers' motion, or None.
+    view_volume : m^3, how much space one look of the camera holds.
     config : the method.
     rng : for K-means.
     """
@@ -52,12 +60,12 @@ def group_flowers(
         return np.zeros(1, dtype=np.int64)
     distance = np.linalg.norm(places[:, None] - places[None], axis=-1)
     if motion is not None:
-        distance = distance * _motion_factor(distance, places, motion, _cut(places, config))
+        distance = distance * _motion_factor(distance, motion, 7.0 * _spacing(places))
     tree = linkage(squareform(distance, checks=False), "single" if config.method == "branch" else "average")
-    label = _numbered(fcluster(tree, _cut(places, config), "distance"))
-    if config.linkage_m is None and not _come_in_clusters(places, presence, label):
-        return np.arange(n)
-    return label
+    if config.linkage_m is not None:
+        return _numbered(fcluster(tree, config.linkage_m, "distance"))
+    label = _likeliest_cut(tree, places, view_volume)
+    return label if _come_in_clusters(places, presence, label) else np.arange(n)
 
 
 def _numbered(label: Array) -> IntArray:
@@ -68,12 +76,43 @@ def _numbered(label: Array) -> IntArray:
     return rank[inverse]
 
 
-def _cut(places: Array, config: GroupingConfig) -> float:
-    """Where the linkage is cut, m: a multiple of how far flowers stand from their nearest."""
-    if config.linkage_m is not None:
-        return config.linkage_m
-    nearest = cKDTree(places).query(places, k=2)[0][:, 1]
-    return config.linkage_per_spacing * float(np.median(nearest))
+def _spacing(places: Array) -> float:
+    """Median distance of a flower to its nearest, m."""
+    return float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
+
+
+def _likeliest_cut(tree: Array, places: Array, view_volume: float) -> IntArray:
+    """Of all cuts of a linkage tree, the clusters that explain the places best.
+
+    Clusters stand anywhere in the space that was looked at; members scatter about their centroid with one sigma for
+    all clusters, the likeliest one; the number of members is Poisson. All heights of the tree are tried.
+    """
+    sides = np.ptp(places, axis=0)
+    volume = max(float(np.prod(np.maximum(sides, 0.1 * sides.max()))), view_volume)
+    prior_sigma = 0.7 * _spacing(places)
+    best, best_score = np.arange(len(places)), -np.inf
+    for height in np.concatenate([[0.0], np.unique(tree[:, 2]) * (1.0 + 1e-12)]):
+        label = fcluster(tree, height, "distance") - 1
+        score = _log_likelihood(label, places, volume, prior_sigma)
+        if score > best_score:
+            best, best_score = label, score
+    return _numbered(best)
+
+
+def _log_likelihood(
+    label: IntArray, places: Array, volume: float, prior_sigma: float, prior_weight: float = 1.0
+) -> float:
+    """Log-likelihood of a partition, sigma at its most probable value (a weak prior keeps it from zero)."""
+    size = np.bincount(label)
+    centre = np.stack([np.bincount(label, places[:, a]) for a in range(3)], axis=-1) / size[:, None]
+    n, c = len(places), len(size)
+    square = float(((places - centre[label]) ** 2).sum())
+    dof = 3.0 * (n - c)
+    var = (square + 3.0 * prior_weight * prior_sigma**2) / (dof + 3.0 * prior_weight)
+    scatter = -0.5 * dof * np.log(2.0 * np.pi * var) - 0.5 * square / var - 1.5 * np.log(size).sum()
+    mean = n / c
+    members = (size * np.log(mean) - mean - gammaln(size + 1.0)).sum()
+    return float(scatter - c * np.log(volume) + members)
 
 
 def _come_in_clusters(places: Array, presence: csr_matrix, label: IntArray) -> bool:
@@ -87,24 +126,28 @@ def _come_in_clusters(places: Array, presence: csr_matrix, label: IntArray) -> b
     return bool(np.median(together) > 0.3)
 
 
-def _motion_factor(distance: Array, places: Array, motion: Motion, cut: float) -> Array:
-    """Factors (l, l) on distances: below one for flowers that move together, above one for those that do not."""
+def _motion_factor(distance: Array, motion: Motion, reach: float) -> Array:
+    """Factors (l, l) on distances from how flowers f, g moved in the frames that saw both, one of them off its rest.
+
+    The ratio sum |u_f - u_g|^2 / sum (|u_f|^2 + |u_g|^2), noise taken out of both, is zero within a cluster and one for
+    flowers that move apart from each other; neighbouring clusters shaken by one touch lie between. Flowers that do not
+    move together are no cluster; that they do says little, so only the first is believed.
+    """
     factor = np.ones_like(distance)
     u = motion.u
     local = _local_mean(u)
-    power = (local * local).sum(-1)
-    noise = 3.0 * motion.var / 5.0
-    moving = power > np.maximum(25.0 * noise, (0.25 * np.median(np.sqrt(motion.var[np.isfinite(motion.var)]))) ** 2)
-    for f, g in zip(*np.nonzero(np.triu(distance < 2.5 * cut, 1)), strict=True):
+    moving = (local * local).sum(-1) > 25.0 * 3.0 * motion.var / 5.0
+    for f, g in zip(*np.nonzero(np.triu(distance < reach, 1)), strict=True):
         use = (moving[:, f] | moving[:, g]) & np.isfinite(u[:, f, 0]) & np.isfinite(u[:, g, 0])
         if use.sum() < 15:
             continue
-        bias = 3.0 * (motion.var[use, f] + motion.var[use, g]).sum()
+        noise = motion.var[use, f] + motion.var[use, g]
+        bias = 3.0 * noise.sum()
         apart = ((u[use, f] - u[use, g]) ** 2).sum() - bias
         signal = (u[use, f] ** 2).sum() + (u[use, g] ** 2).sum() - bias
         if signal > bias:
-            ratio = max(apart, 0.0) / signal
-            factor[f, g] = factor[g, f] = float(np.interp(ratio, [0.2, 0.6, 0.8], [0.4, 1.0, 2.5]))
+            surely = max(apart - 3.0 * np.sqrt(6.0 * (noise**2).sum()), 0.0) / signal
+            factor[f, g] = factor[g, f] = float(np.interp(surely, [0.05, 0.1, 0.4], [0.8, 1.0, 2.5]))
     return factor
 
 

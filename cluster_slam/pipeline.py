@@ -14,7 +14,7 @@ from cluster_slam.association.displacement import (
     motion_scale,
     presence_of,
 )
-from cluster_slam.association.frames import Frames, sort_by_frame
+from cluster_slam.association.frames import Frames, sort_by_frame, view_volume
 from cluster_slam.association.landmarks import flower_spacing, group_means, merge_pieces
 from cluster_slam.association.refine import compact, find_overlooked, merge_ghosts, supported
 from cluster_slam.association.templates import Follower, combine_directions
@@ -129,9 +129,17 @@ def _first_world(frames: Frames, model: PoseModel, config: SmoothConfig, rng: np
     w = transform(T[frames.frame], frames.points)
     radius = 0.65 * _spacing(frames, w, var, labels, shortest)
     landmark, places = merge_pieces(w, var, labels, frames.frame, frames.n_frames, radius, shortest)
-    landmark, places = _keep(supported(landmark, len(places), _minimum(frames, config)), landmark, places)
+    keep = supported(frames, T, places, landmark, _minimum(frames, config))
+    landmark, places = _keep(keep, landmark, places)
     presence = presence_of(frames.frame, landmark, len(places), frames.n_frames)
-    return _World(T, X, landmark, places, group_flowers(places, presence, None, config.grouping, rng=rng), radius)
+    return _World(
+        T,
+        X,
+        landmark,
+        places,
+        group_flowers(places, presence, None, view_volume(frames), config.grouping, rng=rng),
+        radius,
+    )
 
 
 def _scalar_var(frames: Frames, model: PoseModel) -> Array:
@@ -202,7 +210,7 @@ def _smooth(
         of=of,
         frame=frame,
         cluster=cluster,
-        sigma=np.maximum(0.7 * scale, _REST_SIGMA_M),
+        sigma=np.hypot(scale, _REST_SIGMA_M),
         stretch=np.full(len(frame), -1),
         stretch_sigma=np.empty(0),
     )
@@ -229,7 +237,8 @@ def _regroup(frames: Frames, world: _World, config: SmoothConfig, rng: np.random
     u[at] = transform(world.T[frames.frame[used]], frames.points[used]) - world.places[world.landmark[used]]
     var[at] = np.trace(frames.covs[used], axis1=1, axis2=2) / 3.0
     return replace(
-        world, cluster=group_flowers(world.places, presence, Motion(u, var), config.grouping, rng=rng)
+        world,
+        cluster=group_flowers(world.places, presence, Motion(u, var), view_volume(frames), config.grouping, rng=rng),
     )
 
 
@@ -238,8 +247,8 @@ def _mend(
 ) -> tuple[_World, list[tuple[int, int]]]:
     """Merge ghosts, drop what too few observations support, and look for flowers that were overlooked."""
     landmark, merged = merge_ghosts(world.places, world.landmark, frames, 0.6 * world.radius)
-    keep = supported(landmark, len(world.places), _minimum(frames, config))
-    displacement = np.zeros((frames.n_frames, int(pairs.cluster.max(initial=0)) + 1, 3))
+    keep = supported(frames, world.T, world.places, landmark, _minimum(frames, config))
+    displacement = np.full((frames.n_frames, int(pairs.cluster.max(initial=0)) + 1, 3), np.nan)
     displacement[pairs.frame, pairs.cluster] = estimate.d
     owner = np.zeros(len(world.places), dtype=np.int64)
     used = (world.landmark >= 0) & (pairs.of >= 0)
@@ -293,9 +302,7 @@ def _result(
     np.logical_or.at(confirmed, world.cluster, flowers.n_observations >= _minimum(frames, config))
     clusters = cluster_table(rest, frames, confirmed)
     pairs = smoother.pairs
-    _, cov = measured_displacements(
-        frames, estimate.T, world.landmark, estimate.places, pairs.of, len(pairs.frame)
-    )
+    _, cov = measured_displacements(frames, estimate.T, world.landmark, estimate.places, pairs.of, len(pairs.frame))
     drift = drift_table(rest, frames, clusters, estimate.d, pairs.sigma**2, cov)
     flower_ids = np.full(len(frames), -1, dtype=np.int64)
     flower_ids[frames.order] = world.landmark

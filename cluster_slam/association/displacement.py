@@ -46,21 +46,34 @@ def measured_displacements(
 
 
 def motion_scale(
-    d: Array, cov: Array, frame: IntArray, cluster: IntArray, stamps: Array, window_s: float = 0.5
+    d: Array, cov: Array, frame: IntArray, cluster: IntArray, stamps: Array, window_s: float = 0.4
 ) -> Array:
-    """How far each pair's cluster moves around that time, m (0 = at rest): the largest significant local mean."""
+    """How far each pair's cluster stood from rest around that time, m, one sigma along any axis.
+
+    The mean square of the measured displacements (p, 3) over a window, less what their noise (p, 3, 3) explains; then
+    the largest such value of the window, so that the beginning of a shake is covered.
+    """
     n_clusters = int(cluster.max(initial=-1)) + 1
     n = len(stamps)
-    moved = np.zeros((n, n_clusters))
-    chi2 = np.einsum("pi,pij,pj->p", d, information(cov), d)
-    excess = np.sqrt(np.maximum((d * d).sum(1) - np.trace(cov, axis1=1, axis2=2), 0.0))
-    moved[frame, cluster] = np.where(chi2 > 16.0, excess, 0.0)  # 99.9 % of what stands still is below
-    neighbours = np.zeros((n, n_clusters))
-    neighbours[frame, cluster] = chi2 > 9.0
-    count = neighbours.copy()
-    count[1:] += neighbours[:-1]
-    count[:-1] += neighbours[1:]
-    moved[count < 2] = 0.0  # one frame alone is noise
     dt = float(np.median(np.diff(stamps))) if n > 1 else 1.0
-    size = 2 * max(1, round(window_s / dt)) + 1
-    return np.asarray(maximum_filter1d(moved, size, axis=0)[frame, cluster])
+    half = max(1, round(0.5 * window_s / dt))
+    power, count, noise_sq = np.zeros((3, n, n_clusters))
+    noise = np.trace(cov, axis1=1, axis2=2)
+    power[frame, cluster] = (d * d).sum(1) - noise
+    noise_sq[frame, cluster] = np.einsum("pij,pij->p", cov, cov)
+    count[frame, cluster] = 1.0
+    total, seen, spread = (_window_sum(x, half) for x in (power, count, noise_sq))
+    seen = np.maximum(seen, 1.0)
+    # Var(|d|^2) of pure noise is 2 tr(C^2): two sigma of the mean must be passed before motion is believed.
+    excess = np.maximum(total / seen - 2.0 * np.sqrt(2.0 * spread) / seen, 0.0)
+    local = np.where(excess > 0.0, np.maximum(total / seen, 0.0), 0.0)
+    return np.asarray(np.sqrt(maximum_filter1d(local, 2 * half + 1, axis=0)[frame, cluster] / 3.0))
+
+
+def _window_sum(x: Array, half: int) -> Array:
+    """Sums over 2 half + 1 frames (n, c)."""
+    total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, axis=0)])
+    n = len(x)
+    i = np.arange(n)
+    summed: Array = total[np.minimum(i + half + 1, n)] - total[np.maximum(i - half, 0)]
+    return summed

@@ -64,6 +64,25 @@ def sort_by_frame(observations: Observations, stamps: Array) -> Frames:
     )
 
 
+def field_of_view(frames: Frames, quantile: float = 0.002) -> tuple[Array, Array]:
+    """Bounds (3,), (3,) of x / z, y / z and z in which flowers were seen at all, with a little more in depth."""
+    p = frames.points
+    if len(p) == 0:
+        return np.zeros(3), np.zeros(3)
+    rays = np.column_stack([p[:, 0] / p[:, 2], p[:, 1] / p[:, 2], p[:, 2]])
+    return np.quantile(rays, quantile, axis=0), np.quantile(rays, 1.0 - quantile, axis=0)
+
+
+def view_volume(frames: Frames) -> float:
+    """How much space one look holds, m^3: the field of view at the usual depth, as deep as that depth."""
+    if len(frames) == 0:
+        return 1.0
+    low, high = field_of_view(frames)
+    depth = float(np.median(frames.points[:, 2]))
+    width, height = np.maximum(high - low, 0.1)[:2] * depth
+    return float(width * height * depth)
+
+
 def point_jacobian(R: Array, points: Array) -> Array:
     """d (T exp(z) c) / d z at z = 0, (..., 3, 6), for rotations R (..., 3, 3) of T and camera points c (..., 3)."""
     return np.concatenate([-R @ skew(points), np.broadcast_to(R, (*points.shape[:-1], 3, 3))], axis=-1)

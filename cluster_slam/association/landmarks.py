@@ -99,6 +99,8 @@ def merge_pieces(
     """
     count = np.bincount(labels[labels >= 0], minlength=int(labels.max(initial=-1)) + 1)
     kept = np.flatnonzero(count >= min_count)
+    if len(kept) == 0:
+        return np.full(len(labels), -1, dtype=np.int64), np.empty((0, 3))
     piece_of = np.full(len(count) + 1, -1, dtype=np.int64)
     piece_of[kept] = np.arange(len(kept))
     piece = piece_of[labels]

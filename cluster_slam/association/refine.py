@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cluster_slam.association.displacement import presence_of
-from cluster_slam.association.frames import Frames
+from cluster_slam.association.frames import Frames, field_of_view
 from cluster_slam.association.landmarks import merge_pieces
 from cluster_slam.association.tracklets import build_tracklets
 from cluster_slam.config import TrackletConfig
@@ -38,10 +38,35 @@ def merge_ghosts(
     return np.where(landmark >= 0, target[landmark], -1), merged
 
 
-def supported(landmark: IntArray, n: int, minimum: int) -> Array:
-    """Which landmarks (n,) have at least ``minimum`` observations."""
-    enough: Array = np.bincount(landmark[landmark >= 0], minlength=n) >= minimum
-    return enough
+def supported(
+    frames: Frames, T: Array, places: Array, landmark: IntArray, minimum: int, least_share: float = 0.2
+) -> Array:
+    """Which landmarks (l,) are believed: often enough seen at all, and in enough of the frames that looked at them.
+
+    Flowers are seen in about the same share of the frames in which they are in view. What is seen in less than
+    ``least_share`` of that (the place of a flower during a shake, a false detection that came twice) is none.
+    """
+    count = np.bincount(landmark[landmark >= 0], minlength=len(places)).astype(float)
+    if not count.any():
+        return count >= minimum
+    share = count / np.maximum(frames_in_view(frames, T, places), count)
+    order = np.argsort(share)
+    usual = share[order][np.searchsorted(np.cumsum(count[order]), 0.5 * count.sum())]
+    believed: Array = (count >= minimum) & (share >= least_share * usual)
+    return believed
+
+
+def frames_in_view(frames: Frames, T: Array, places: Array) -> Array:
+    """Number of frames (l,) whose field of view holds each place (l, 3)."""
+    low, high = field_of_view(frames)
+    total = np.zeros(len(places))
+    for chunk in np.array_split(np.arange(frames.n_frames), 1 + frames.n_frames // 500):
+        R, t = T[chunk, :3, :3], T[chunk, :3, 3]
+        p = np.einsum("nba,nlb->nla", R, places[None] - t[:, None])
+        z = np.maximum(p[..., 2], 1e-9)
+        rays = np.stack([p[..., 0] / z, p[..., 1] / z, p[..., 2]], axis=-1)
+        total += ((rays >= low) & (rays <= high)).all(axis=-1).sum(axis=0)
+    return total
 
 
 def compact(keep: Array, landmark: IntArray) -> IntArray:
@@ -66,7 +91,8 @@ def find_overlooked(
     """Places (k, 3) of flowers that no landmark stands for yet, among the observations left over.
 
     Each left-over point is moved back by the displacement (n, c, 3) of the cluster next to it, in its own frame: a
-    flower that was only seen while its cluster swayed stands still after that.
+    flower that was only seen while its cluster swayed stands still after that. Where that cluster was not seen (NaN)
+    nothing is known of the point.
     """
     left = np.flatnonzero(landmark < 0)
     if len(left) < minimum:
@@ -75,6 +101,8 @@ def find_overlooked(
     if len(places):
         nearest = cluster[cKDTree(places).query(world)[1]]
         world = world - displacement[frames.frame[left], nearest]
+        known = np.isfinite(world[:, 0])
+        left, world = left[known], world[known]
     points = transform(inverse(T)[frames.frame[left]], world)
     rest = Frames(
         order=left,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cluster_slam.association.frames import Frames, information, point_jacobian
+from cluster_slam.association.frames import Frames, field_of_view, information, point_jacobian
 from cluster_slam.association.tracklets import match, solve_pose_correction
 from cluster_slam.config import TemplateConfig
 from cluster_slam.geometry import Array, inverse, rotate_cov, se3_exp, transform
@@ -27,13 +27,6 @@ class Followed:
     chi2: Array
     score: Array  # (n, c)
     correction: Array  # (n, 6) pose corrections
-
-
-def field_of_view(frames: Frames, quantile: float = 0.002) -> tuple[Array, Array]:
-    """Bounds (3,), (3,) of x / z, y / z and z in which flowers were seen at all, with a little more in depth."""
-    p = frames.points
-    rays = np.column_stack([p[:, 0] / p[:, 2], p[:, 1] / p[:, 2], p[:, 2]])
-    return np.quantile(rays, quantile, axis=0), np.quantile(rays, 1.0 - quantile, axis=0)
 
 
 class _Springs:
@@ -191,23 +184,20 @@ class Follower:
             found[j] = best
             free[best.cols] = False
             for k in list(waiting):
-                if np.isin(waiting[k].cols, best.cols).any():
+                if not free[waiting[k].cols].all():
                     waiting[k] = self._best_hypothesis(k, flowers, owner, w, S, free)
-        return self._with_found(found, flowers, owner, rows, cols, chi2)
+        return self._with_found(found, owner, rows, cols, chi2, len(w))
 
     def _with_found(
-        self,
-        found: dict[int, _Hypothesis],
-        flowers: IntArray,
-        owner: IntArray,
-        rows: IntArray,
-        cols: IntArray,
-        chi2: Array,
+        self, found: dict[int, _Hypothesis], owner: IntArray, rows: IntArray, cols: IntArray, chi2: Array, n_points: int
     ) -> tuple[IntArray, IntArray, Array]:
         if not found:
             return rows, cols, chi2
-        taken = np.concatenate([h.cols for h in found.values()])
-        stays = ~np.isin(owner[rows], list(found)) & ~np.isin(cols, taken)
+        moved = np.zeros(self.n_clusters, dtype=bool)
+        moved[list(found)] = True
+        taken = np.zeros(n_points, dtype=bool)
+        taken[np.concatenate([h.cols for h in found.values()])] = True
+        stays = ~moved[owner[rows]] & ~taken[cols]
         for j, h in found.items():
             if h.is_jump:
                 self.springs.jump(j, h.d, h.cov)
@@ -224,50 +214,58 @@ class Follower:
         mine = np.flatnonzero(owner == j)
         L = self.places[flowers[mine]]
         reach = cfg.reach_m if s.unseen[j] < 5 else cfg.reach_unseen_m
-        centre, extent = L.mean(0), np.linalg.norm(L - L.mean(0), axis=1).max()
-        pool = np.flatnonzero(free & (((w - centre) ** 2).sum(1) < (reach + extent) ** 2))
-        if len(pool) < 2 or len(mine) < 2:
+        pool = np.flatnonzero(free)
+        step = w[pool][None] - L[:, None]
+        near = (step * step).sum(-1) < reach * reach
+        used = near.any(axis=0)
+        if used.sum() < 2 or len(mine) < 2:
             return _NOTHING
+        pool, step, near = pool[used], step[:, used], near[:, used]
         points, W = w[pool], information(S[pool] + cfg.landmark_sigma_m**2 * np.eye(3))
-        d = (points[None] - L[:, None]).reshape(-1, 3)
-        d = d[(d * d).sum(1) < reach * reach]
-        d = np.concatenate([d, s.x[j : j + 1, :3], np.zeros((1, 3))])
+        d = np.concatenate([step[near], s.x[j : j + 1, :3], np.zeros((1, 3))])
+        prior = _JumpPrior(s.x[j, :3], s.P[j, :3, :3], cfg.jump_sigma_m * (1.0 if s.unseen[j] < 5 else 2.0))
         gain = _gains(d, L, points, 0.5 * W, cfg.match_gain)
-        total = gain.max(axis=2).sum(axis=1) + self._prior(j, d)
+        total = gain.max(axis=2).sum(axis=1) + prior(d)
         best = _NOTHING
-        for h in np.argsort(-total, kind="stable")[:4]:
-            hypothesis = self._refine(j, d[h], L, points, W, mine, pool)
+        for h in np.argsort(-total, kind="stable")[:3]:
+            if total[h] < max(cfg.min_score, best.score):
+                break
+            hypothesis = self._refine(j, d[h], L, points, W, mine, pool, prior)
             if hypothesis.score > best.score:
                 best = hypothesis
         return best
 
-    def _prior(self, j: int, d: Array) -> Array:
-        """Log-likelihood of displacements (h, 3): as the spring predicts, or after a jump."""
-        s, cfg = self.springs, self.config
-        step = d - s.x[j, :3]
-        chi2 = np.einsum("hi,ij,hj->h", step, information(s.P[j, :3, :3] + 1e-12 * np.eye(3)), step)
-        sigma = cfg.jump_sigma_m if s.unseen[j] < 5 else 2.0 * cfg.jump_sigma_m
-        return np.maximum(-0.5 * chi2, -6.0 - 0.5 * (step * step).sum(1) / sigma**2)
-
     def _refine(
-        self, j: int, d: Array, L: Array, points: Array, W: Array, mine: IntArray, pool: IntArray
+        self, j: int, d: Array, L: Array, points: Array, W: Array, mine: IntArray, pool: IntArray, prior: _JumpPrior
     ) -> _Hypothesis:
         """The displacement from all flowers that fit it, matched one to one, and its final score."""
-        cfg = self.config
-        rows = cols = np.empty(0, dtype=np.int64)
-        for scale in (0.5, 1.0, 1.0):
-            gain = _gains(d[None], L, points, scale * W, cfg.match_gain)[0]
+        gain_at_zero = self.config.match_gain
+        for scale in (0.5, 1.0):
+            gain = _gains(d[None], L, points, scale * W, gain_at_zero)[0]
             rows, cols = _greedy(gain)
             if len(rows) < 2:
                 return _NOTHING
             total = W[cols].sum(0)
             d = np.linalg.solve(total, (W[cols] @ (points[cols] - L[rows])[..., None])[..., 0].sum(0))
-        matched = gain[rows, cols]
-        score = matched.sum() - (len(L) - len(rows)) + self._prior(j, d[None])[0]
-        is_jump = self._prior(j, d[None])[0] < -6.0 or self.springs.unseen[j] > 0
-        return _Hypothesis(
-            float(score), mine[rows], pool[cols], 2.0 * (cfg.match_gain - matched), d, np.linalg.inv(total), is_jump
-        )
+        residual = points[cols] - L[rows] - d
+        chi2 = np.einsum("qi,qij,qj->q", residual, W[cols], residual)
+        log_prior = float(prior(d[None])[0])
+        score = np.maximum(gain_at_zero - 0.5 * chi2, 0.0).sum() - (len(L) - len(rows)) + log_prior
+        is_jump = log_prior < -6.0 or self.springs.unseen[j] > 0
+        return _Hypothesis(float(score), mine[rows], pool[cols], chi2, d, np.linalg.inv(total), is_jump)
+
+
+class _JumpPrior:
+    """Log-likelihood of displacements (h, 3): as the spring predicts, or after a jump."""
+
+    def __init__(self, predicted: Array, P: Array, jump_sigma: float) -> None:
+        self.predicted, self.jump_sigma = predicted, jump_sigma
+        self.information = information(P + 1e-12 * np.eye(3))
+
+    def __call__(self, d: Array) -> Array:
+        step = d - self.predicted
+        chi2 = ((step @ self.information) * step).sum(1)
+        return np.maximum(-0.5 * chi2, -6.0 - 0.5 * (step * step).sum(1) / self.jump_sigma**2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -287,8 +285,9 @@ _NOTHING = _Hypothesis(-np.inf, _EMPTY, _EMPTY, np.empty(0), np.zeros(3), np.eye
 
 def _gains(d: Array, L: Array, points: Array, W: Array, match_gain: float) -> Array:
     """Gains (h, f, p) of matching flowers L + d with points: match_gain - chi2 / 2, at least zero."""
-    diff = points[None, None] - (L[None, :] + d[:, None])[:, :, None]
-    chi2 = np.einsum("hfpi,hfpi->hfp", (W[None, None] @ diff[..., None])[..., 0], diff)
+    x, y, z = np.moveaxis(points[None, None] - (L[None, :] + d[:, None])[:, :, None], -1, 0)
+    chi2 = x * (W[:, 0, 0] * x + 2.0 * (W[:, 0, 1] * y + W[:, 0, 2] * z))
+    chi2 += y * (W[:, 1, 1] * y + 2.0 * W[:, 1, 2] * z) + W[:, 2, 2] * z * z
     return np.maximum(match_gain - 0.5 * chi2, 0.0)
 
 
