@@ -1,0 +1,108 @@
+"""The whole command on sessions with next to nothing in them: a result in the format, poor where nothing was found."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from folders import TOML, write_folder
+from result_format import check_result_folder
+
+from cluster_slam.cli.app import run
+from cluster_slam.geometry import Array
+
+N_FRAMES = 40
+KINDS = {
+    "camera": TOML,
+    "flange": TOML.replace('"T_world_camera"', '"T_world_flange"\nT_flange_camera = [0, 0, 0.05, 0, 0, 0, 1]'),
+    "odometry": TOML.replace('"T_world_camera"', '"T_world_camera"\npose_error = "odometry"'),
+}
+PLACES = np.array([[0.1, 0.0, 0.6], [0.13, 0.02, 0.62], [0.08, 0.03, 0.58]])  # m, from the first camera
+
+
+@dataclass(frozen=True, eq=False)
+class Strange:
+    """Frames that move sideways by ``step`` and flowers that they see."""
+
+    frame: np.ndarray  # (m,)
+    points: Array  # (m, 3)
+    n_frames: int = N_FRAMES
+    step: float = 0.01  # m a frame
+
+
+def seen(flowers: int, frames: int = N_FRAMES, times: int = 1, n_frames: int = N_FRAMES, step: float = 0.01) -> Strange:
+    """``flowers`` flowers in the first ``frames`` frames, each ``times`` times in a frame."""
+    frame, flower, _ = (a.ravel() for a in np.indices((frames, flowers, times)))
+    noise = np.random.default_rng(0).normal(0, 0.002, (len(frame), 3))
+    moved = step * frame[:, None] * np.array([1.0, 0.0, 0.0])
+    return Strange(frame, PLACES[flower] - moved + noise, n_frames, step)
+
+
+def clutter() -> Strange:
+    """Four detections a frame, all over the place."""
+    points = np.random.default_rng(1).uniform([-0.4, -0.3, 0.4], [0.4, 0.3, 1.0], (4 * N_FRAMES, 3))
+    return Strange(np.repeat(np.arange(N_FRAMES), 4), points)
+
+
+STRANGE = {
+    "one frame": seen(3, frames=1, n_frames=1),
+    "one frame, one flower": seen(1, frames=1, n_frames=1),
+    "two frames": seen(3, frames=2, n_frames=2),
+    "one flower": seen(1),
+    "each flower twice": seen(3, times=2),
+    "a camera that stands still": seen(3, step=0.0),
+    "three flowers": seen(3),
+}
+NOTHING = {
+    "no flowers": seen(0),
+    "one frame, no flowers": seen(0, n_frames=1),
+    "all clutter": clutter(),
+}
+
+
+def write(folder: Path, toml: str, strange: Strange, backwards: bool = False) -> Path:
+    stamps = [f"{100 + i / 10:.6f}" for i in range(strange.n_frames)]
+    poses = "".join(f"{t} {strange.step * i:.6f} 0 0 0 0 0 1\n" for i, t in enumerate(stamps))
+    rows = [
+        f"{stamps[i]},{x:.6f},{y:.6f},{z:.6f}\n" for i, (x, y, z) in zip(strange.frame, strange.points, strict=True)
+    ]
+    table = "timestamp,x,y,z\n" + "".join(reversed(rows) if backwards else rows)
+    return write_folder(folder, {"session.toml": toml, "poses.txt": poses, "flowers.csv": table})
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", STRANGE)
+def test_a_strange_session_gives_a_result(tmp_path: Path, name: str, kind: str) -> None:
+    session = write(tmp_path / "session", KINDS[kind], STRANGE[name])
+    assert run(["smooth", str(session), "-o", str(tmp_path / "out"), "--quiet"]) in (0, 1)
+    check_result_folder(tmp_path / "out", session)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", NOTHING)
+def test_a_session_with_nothing_in_it_gives_a_poor_result(
+    tmp_path: Path, name: str, kind: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = write(tmp_path / "session", KINDS[kind], NOTHING[name])
+    assert run(["smooth", str(session), "-o", str(tmp_path / "out"), "--quiet"]) == 1
+    assert capsys.readouterr().err.startswith("warning: the result is poor: ")
+    check_result_folder(tmp_path / "out", session)
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["status"] == "poor"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_order_of_the_rows_does_not_matter(tmp_path: Path, kind: str) -> None:
+    """Backwards: the same clusters, and each row with its own flower."""
+    ids = []
+    for backwards in (False, True):
+        session = write(tmp_path / f"s{backwards}", KINDS[kind], STRANGE["three flowers"], backwards)
+        out = tmp_path / f"o{backwards}"
+        assert run(["smooth", str(session), "-o", str(out), "--quiet"]) == 0
+        check_result_folder(out, session)
+        lines = (out / "observations.csv").read_text().splitlines()[1:]
+        ids.append([line.split(",")[1] for line in lines])
+    pairs = set(zip(ids[0], reversed(ids[1]), strict=True))
+    assert len(pairs) == len(set(ids[0]))
