@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -126,3 +127,45 @@ def unscented_transform(
     """
     points = sigma_points(mean, cov, rule)
     return combine(np.asarray(function(points), float), rule, points.shape[-1], beta)
+
+
+def fifth_degree(mean: Array, cov: Array, function: Callable[[Array], Array]) -> tuple[Array, Array]:
+    """Mean and covariance by the cubature rule that integrates polynomials up to the fifth degree exactly.
+
+    2 L^2 + 1 points instead of 2 L + 1: the mean is exact for a function of the fifth degree, the covariance for one of
+    the second, whatever the dimension, which no choice of alpha, beta and kappa achieves (McNamee, Stenger 1967; Jia,
+    Xin, Cheng 2013). Shapes as in `unscented_transform`; some weights are negative from L = 5 on, so that a covariance
+    is not positive definite by construction.
+
+    Raises
+    ------
+    CovarianceError
+        A covariance is not positive definite.
+    """
+    mean = np.asarray(mean, float)
+    directions, weights = _fifth_degree_rule(mean.shape[-1])
+    factor = cholesky(np.asarray(cov, float))
+    values = np.asarray(function(mean[..., None, :] + directions @ np.swapaxes(factor, -1, -2)), float)
+    centre = np.asarray(function(mean), float)
+    delta = values - centre[..., None, :]
+    shift = (weights[:, None] * delta).sum(-2)
+    second = np.swapaxes(delta, -1, -2) @ (weights[:, None] * delta)
+    return centre + shift, symmetrise(second - shift[..., :, None] * shift[..., None, :])
+
+
+@lru_cache(maxsize=32)
+def _fifth_degree_rule(length: int) -> tuple[Array, Array]:
+    """Points (2 L^2, L) other than the origin, for the standard normal, and their weights."""
+    spread = np.sqrt(length + 2.0)
+    axes = spread * np.concatenate([np.eye(length), -np.eye(length)])
+    pairs = [
+        s * np.eye(length)[i] + t * np.eye(length)[j]
+        for i in range(length)
+        for j in range(i + 1, length)
+        for s in (1.0, -1.0)
+        for t in (1.0, -1.0)
+    ]
+    diagonals = spread / np.sqrt(2.0) * np.array(pairs).reshape(-1, length)
+    on_axes = (4.0 - length) / (2.0 * (length + 2.0) ** 2)
+    weights = np.concatenate([np.full(len(axes), on_axes), np.full(len(diagonals), 1.0 / (length + 2.0) ** 2)])
+    return np.concatenate([axes, diagonals]), weights
