@@ -13,6 +13,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from folders import LEVEL_3, write_folder
 from made_result import make
@@ -23,9 +24,10 @@ from cluster_slam.cli.progress import StageProgress
 from cluster_slam.cli.smooth import smooth_config
 from cluster_slam.config import GroupingConfig, SmoothConfig
 from cluster_slam.errors import ConfigError
+from cluster_slam.io.session import open_session
 from cluster_slam.io.session_writer import write_session
 from cluster_slam.records import Result, Session
-from cluster_slam.simulate.config import SimulateConfig
+from cluster_slam.simulate import PRESETS, SimulateConfig, simulate_session
 
 MADE = make(3, n_frames=60)
 HEAVY = ["numpy", "scipy", "gtsam", "cv2", "plotly", "matplotlib", "filterpy", "onnxruntime", "sqlite3"]
@@ -228,6 +230,22 @@ def test_simulate_writes_a_session(tmp_path: Path, capsys: pytest.CaptureFixture
     facts = json.loads(capsys.readouterr().out)
     assert facts["level"] == 3
     assert facts["duration_s"] == pytest.approx(2.0, abs=0.1)
+
+
+def test_simulate_does_not_replace_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_folder(tmp_path / "s", LEVEL_3)
+    assert run(["simulate", str(folder), "--preset", "sample"]) == 2
+    assert "holds the session 'small', which is not simulated" in capsys.readouterr().err
+    assert sorted(path.name for path in folder.iterdir()) == sorted(LEVEL_3)
+
+
+def test_level_2_of_the_simulation_is_lifted_to_where_it_was(tmp_path: Path) -> None:
+    settings = ["--preset", "sample", "--set", "duration_s=1.0", "--set", "level=2", "--quiet"]
+    assert run(["simulate", str(tmp_path / "s"), *settings]) == 0
+    seen = open_session(tmp_path / "s").observations
+    made = simulate_session(replace(PRESETS["sample"], duration_s=1.0, level=2), seed=0).session.observations
+    np.testing.assert_allclose(seen.points, made.points, atol=1e-9)
+    np.testing.assert_allclose(seen.covs, made.covs, rtol=1e-6, atol=1e-13)
 
 
 def test_unknown_presets_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -53,7 +53,7 @@ def session_facts(session: Session, truth: Truth | None) -> dict[str, Any]:
         "poses": f"{session.pose_frame}, {session.pose_error}",
         "observations": len(seen),
         "observations_per_frame": round(len(seen) / session.n_frames, 3),
-        "covariances": "given" if seen.has_covariance else "from the stated sigma",
+        "covariances": _covariances(session),
         "scores": "given" if np.isfinite(seen.scores).any() else "none",
     }
     if len(seen):
@@ -62,6 +62,12 @@ def session_facts(session: Session, truth: Truth | None) -> dict[str, Any]:
         sigma = np.sqrt(np.trace(seen.covs, axis1=1, axis2=2) / 3)
         facts["median_sigma_m"] = float(f"{np.median(sigma):.3g}")
     return {**facts, "truth": ", ".join(truth_parts(truth)) or "none"}
+
+
+def _covariances(session: Session) -> str:
+    if session.level == 2:
+        return "from the stated noise of pixel and depth"
+    return "given" if session.observations.has_covariance else "from the stated sigma"
 
 
 def truth_parts(truth: Truth | None) -> list[str]:

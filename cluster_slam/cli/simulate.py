@@ -11,7 +11,9 @@ import typer
 from cluster_slam.cli.options import ConfigOption, JsonOption, QuietOption, SeedOption, SetOption, configured
 from cluster_slam.cli.progress import StageProgress
 from cluster_slam.cli.summary import print_json, print_table
-from cluster_slam.errors import ConfigError
+from cluster_slam.errors import ConfigError, OutputError
+
+SIMULATED = "simulated-"  # how the id of a simulated session begins
 
 
 def command(
@@ -38,6 +40,7 @@ def command(
         near = difflib.get_close_matches(preset, PRESETS, 1)
         hint = f"; did you mean {near[0]}?" if near else ""
         raise ConfigError(f"unknown preset {preset!r}{hint} (known: {', '.join(PRESETS)})")
+    _check_replaceable(out)
     options = configured(PRESETS[preset], config, settings or [])
     with StageProgress(is_shown=not (quiet or as_json)) as progress:
         progress("simulating", 0.0)
@@ -47,3 +50,18 @@ def command(
     elif not quiet:
         print_table("cluster-slam simulate", [("preset", preset), ("seed", str(seed)), ("session", str(out))])
     return 0
+
+
+def _check_replaceable(out: Path) -> None:
+    """Refuse a folder with a session that somebody recorded.
+
+    Raises
+    ------
+    OutputError
+        The session there is not a simulated one.
+    """
+    from cluster_slam.io.metadata import read_metadata
+
+    path = out / "session.toml"
+    if path.exists() and not (found := read_metadata(path)[0].id).startswith(SIMULATED):
+        raise OutputError(f"{out}: holds the session {found!r}, which is not simulated, expected a free name")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cluster_slam import __version__
 from cluster_slam.errors import EstimationError, OutputError
 from cluster_slam.geometry import Array, tum_from_pose
 from cluster_slam.io.folder import check_writable, recover, write_folder
@@ -138,7 +138,7 @@ def _check_finite(result: Result) -> None:
 def run_record(result: Result, files: list[str]) -> dict[str, Any]:
     """What ``run.json`` says about the run, ready for JSON."""
     return {
-        "version": __version__,
+        "version": version("cluster-slam"),
         "command": result.command,
         "session": result.session.id,
         "session_path": None if result.session.path is None else os.path.abspath(result.session.path),
