@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import difflib
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import repeat
@@ -86,17 +85,20 @@ def read_table(
     if len(lines) > 1 and lines[-1].strip():
         warnings.append(f"{path}: {UNFINISHED}")
     numbered = [(i, line) for i, line in enumerate(lines[1:], 2) if line.strip()]
-    cells = _cells(path, numbered, len(header))
-    names = [*required, *(name for name in optional if name in header)]
-    columns = {name: cells[header.index(name) :: len(header)] for name in names}
     rows = np.array([i for i, _ in numbered], dtype=np.int64)
-    return Table(
-        path,
-        {name: _numbers(path, name, rows, values, name in optional) for name, values in columns.items()},
-        rows,
-        tuple(w for w in warnings if w),
-        {name: [cell.strip() for cell in cells[header.index(name) :: len(header)]] for name in words if name in header},
-    )
+    body = _lines(path, numbered, len(header))
+    names = [*required, *(name for name in optional if name in header)]
+    columns = _columns(body, header, names)
+    if columns is None:  # something is no number: cell by cell, to say what
+        texts = {name: _column(body, header.index(name)) for name in names}
+        columns = {name: _numbers(path, name, rows, cells, name in optional) for name, cells in texts.items()}
+    for name, values in columns.items():
+        bad = np.isinf(values) if name in optional else ~np.isfinite(values)
+        if bad.any():
+            k = int(bad.argmax())
+            raise _no_number(path, int(rows[k]), name, body[k].split(",")[header.index(name)])
+    read_words = {name: _column(body, header.index(name)) for name in words if name in header}
+    return Table(path, columns, rows, tuple(w for w in warnings if w), read_words)
 
 
 def _header(path: Path, line: str, required: Sequence[str]) -> list[str]:
@@ -131,15 +133,15 @@ def _unknown(path: Path, header: Sequence[str], known: Sequence[str]) -> str:
     return f"{path}: row 1: unknown columns are ignored: {', '.join(hints)}"
 
 
-def _cells(path: Path, numbered: list[tuple[int, str]], width: int) -> list[str]:
-    """All cells, row after row; every row has as many as the header."""
+def _lines(path: Path, numbered: list[tuple[int, str]], width: int) -> list[str]:
+    """The rows as text without quotes; each has as many cells as the header."""
     lines = [line for _, line in numbered]
     if any('"' in line for line in lines):
         lines = [_unquoted(path, i, line) for i, line in numbered]
     for (i, line), commas in zip(numbered, map(str.count, lines, repeat(",")), strict=True):
         if commas != width - 1:
             raise InputError(f"{path}: row {i}: {commas + 1} values ({shown(line)}), expected {width} as in the header")
-    return ",".join(lines).split(",") if lines else []
+    return lines
 
 
 def _unquoted(path: Path, row: int, line: str) -> str:
@@ -150,24 +152,34 @@ def _unquoted(path: Path, row: int, line: str) -> str:
         raise InputError(f"{path}: row {row}: {error} ({shown(line)}), expected comma separated values") from None
 
 
-def _numbers(path: Path, name: str, rows: IntArray, cells: list[str], is_optional: bool) -> Array:
+def _column(lines: list[str], k: int) -> list[str]:
+    return [line.split(",")[k].strip() for line in lines]
+
+
+def _columns(lines: list[str], header: list[str], names: list[str]) -> dict[str, Array] | None:
+    """Columns of numbers by name; None where a cell is no number."""
+    if not lines:
+        return {name: np.zeros(0) for name in names}
     try:
-        values = np.array(list(map(float, cells)), dtype=np.float64)
+        values = np.loadtxt(lines, delimiter=",", usecols=[header.index(n) for n in names], comments=None, ndmin=2)
     except ValueError:
-        values = np.array([_number(path, name, int(i), cell, is_optional) for i, cell in zip(rows, cells, strict=True)])
-    bad = np.isinf(values) if is_optional else ~np.isfinite(values)
-    if bad.any():
-        k = int(bad.argmax())
-        raise InputError(f"{path}: row {rows[k]}: {name} is {shown(cells[k].strip())}, expected a finite number")
+        return None
+    return {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(names)}
+
+
+def _numbers(path: Path, name: str, rows: IntArray, cells: list[str], is_optional: bool) -> Array:
+    """A column, cell by cell; an optional one may have empty cells."""
+    values = np.full(len(cells), np.nan)
+    for k, cell in enumerate(cells):
+        if cell or not is_optional:
+            if not _is_number(cell):
+                raise _no_number(path, int(rows[k]), name, cell)
+            values[k] = float(cell)
     return values
 
 
-def _number(path: Path, name: str, row: int, cell: str, is_optional: bool) -> float:
-    if is_optional and not cell.strip():
-        return math.nan
-    if not _is_number(cell):
-        raise InputError(f"{path}: row {row}: {name} is {shown(cell.strip())}, expected a finite number")
-    return float(cell)
+def _no_number(path: Path, row: int, name: str, cell: str) -> InputError:
+    return InputError(f"{path}: row {row}: {name} is {shown(cell.strip())}, expected a finite number")
 
 
 def _is_number(cell: str) -> bool:
@@ -196,6 +208,10 @@ def read_tum(path: Path, what: str = "a TUM trajectory") -> Table:
             raise InputError(f"{path}: row {i}: {len(row)} values ({shown(line)}), expected 8: {' '.join(names)}")
     rows = np.array([i for i, _ in numbered], dtype=np.int64)
     columns = {name: _numbers(path, name, rows, [row[k] for row in split], False) for k, name in enumerate(names)}
+    for k, name in enumerate(names):
+        if not np.isfinite(columns[name]).all():
+            i = int((~np.isfinite(columns[name])).argmax())
+            raise _no_number(path, int(rows[i]), name, split[i][k])
     warnings = (f"{path}: {UNFINISHED}",) if lines[-1].split("#", 1)[0].strip() else ()
     return _checked_trajectory(Table(path, columns, rows, warnings))
 
