@@ -30,7 +30,7 @@ from cluster_slam.records import Result, Session
 from cluster_slam.simulate import PRESETS, SimulateConfig, simulate_session
 
 MADE = make(3, n_frames=60)
-HEAVY = ["numpy", "scipy", "gtsam", "cv2", "plotly", "matplotlib", "filterpy", "onnxruntime", "sqlite3"]
+HEAVY = ["numpy", "scipy", "gtsam", "cv2", "plotly", "matplotlib", "filterpy", "onnxruntime", "rich"]
 COMMANDS = ["smooth", "simulate", "evaluate", "check", "figures", "reproduce paper"]
 Smooth = Callable[..., Result]
 
@@ -80,6 +80,15 @@ sys.exit(code)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr.strip() == "[]"
     assert "Example: cluster-slam" in done.stdout or not command
+
+
+def test_no_arguments_is_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run([]) == 0
+    bare = capsys.readouterr().out
+    assert run(["--help"]) == 0
+    assert capsys.readouterr().out == bare
+    for name in COMMANDS:
+        assert re.search(rf"^  {name.split()[0]} +[A-Z].*[^.][.]$", bare, re.MULTILINE)
 
 
 def test_help_takes_less_than_half_a_second() -> None:
@@ -338,6 +347,7 @@ def test_check_says_what_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[
         (["smooth", "x"], "Missing option '--out' / '-o'"),
         (["smooth", "x", "-o", "y", "--sed", "3"], "No such option: --sed"),
         (["smooth", "x", "-o", "y", "--seed", "a"], "Invalid value for '--seed'"),
+        (["reproduce"], "Missing command"),
         (["smoth"], "No such command 'smoth'"),
     ],
 )

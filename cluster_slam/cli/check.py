@@ -21,7 +21,9 @@ def command(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Read a session, check every value of it, and say what is in it.
+    """Read a session and say what is in it.
+
+    Every value is checked; what looks odd but can be used is a warning.
 
     Example: cluster-slam check data/sample
     """

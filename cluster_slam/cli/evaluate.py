@@ -18,7 +18,9 @@ def command(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Compare a result with the ground truth of its session: trajectory, identities, clutter, landmarks, covariances.
+    """Compare a result with the truth of its session.
+
+    Trajectory, hand-eye transform, identities, clutter, landmarks, and whether the covariances are true.
 
     Example: cluster-slam evaluate out/demo data/sample
     """

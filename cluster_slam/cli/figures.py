@@ -24,7 +24,9 @@ def command(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Draw the figures of a result: map, trajectory, misfit, sway, timeline.
+    """Draw the figures of a result for a paper.
+
+    Map, trajectory, misfit, sway and timeline, each where the result has data for it.
 
     Example: cluster-slam figures out/demo -o out/figures
     """

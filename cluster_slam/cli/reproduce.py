@@ -11,7 +11,7 @@ from cluster_slam.cli.options import JsonOption, QuietOption
 from cluster_slam.cli.progress import StageProgress
 from cluster_slam.cli.summary import print_json, print_table, print_warnings
 
-app = typer.Typer(no_args_is_help=True, help="Run a published evaluation again.")
+app = typer.Typer(help="Run a published evaluation again.")
 
 
 @app.callback()
@@ -30,7 +30,9 @@ def paper(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Recompute tables I to III and figures 2 to 8 of the paper, and say what does not reproduce.
+    """Recompute the paper's tables and figures.
+
+    Tables I to III and figures 2 to 8, beside what the paper prints; what does not reproduce is said.
 
     Example: cluster-slam reproduce paper -o out/paper
     """

@@ -28,7 +28,9 @@ def command(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Write a session of a simulated bramble plant with its ground truth; the same seed gives the same bytes.
+    """Write a session of a simulated plant, with its truth.
+
+    The same preset, options and seed give the same bytes.
 
     Example: cluster-slam simulate out/session --preset moderate --seed 3 --set sway_m=0.01
     """

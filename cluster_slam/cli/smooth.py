@@ -65,7 +65,10 @@ def command(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Turn a recorded session into a map of flower clusters: trajectory, hand-eye, landmarks, who is who, a report.
+    """Turn a recorded session into a map of flower clusters.
+
+    OUT gets the trajectory, the hand-eye transform, clusters and flowers with covariances, which observation is of
+    which flower, what was clutter, and a report.
 
     Example: cluster-slam smooth data/sample -o out/demo
     """
