@@ -57,6 +57,19 @@ def cholesky(cov: Array, name: str = "covariance") -> Array:
     return np.asarray(lower, dtype=np.float64)
 
 
+def symmetric_root(cov: Array, name: str = "covariance") -> Array:
+    """Symmetric square roots (..., d, d) of covariances that may be singular.
+
+    Raises
+    ------
+    CovarianceError
+        A matrix is not positive semidefinite.
+    """
+    values, axes = np.linalg.eigh(ensure_positive_semidefinite(cov, name))
+    out: Array = (axes * np.sqrt(np.maximum(values, 0.0))[..., None, :]) @ np.swapaxes(axes, -1, -2)
+    return out
+
+
 def forward_substitution(lower: Array, vectors: Array) -> Array:
     """L^-1 v for lower triangular factors (..., d, d) and vectors (..., d)."""
     shape = np.broadcast_shapes(lower.shape[:-1], vectors.shape)

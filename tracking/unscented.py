@@ -65,8 +65,10 @@ class SigmaRule:
 CUBATURE = SigmaRule(alpha=1.0, beta=0.0, kappa=0.0)  # the third-degree spherical rule of Arasaratnam, Haykin (2009)
 
 
-def sigma_points(mean: Array, cov: Array, rule: SigmaRule) -> Array:
-    """Sigma points (..., 2 L + 1, L): the mean, mean + h c_j, mean - h c_j with the columns c_j of the Cholesky factor.
+def sigma_points(mean: Array, cov: Array, rule: SigmaRule, factor: Array | None = None) -> Array:
+    """Sigma points (..., 2 L + 1, L): the mean, mean + h c_j, mean - h c_j.
+
+    The c_j are the columns of `factor` (..., L, L), any F with F F' = cov; without it, of the Cholesky factor.
 
     Raises
     ------
@@ -77,7 +79,7 @@ def sigma_points(mean: Array, cov: Array, rule: SigmaRule) -> Array:
     length = mean.shape[-1]
     if cov.shape[-2:] != (length, length):
         raise ParameterError(f"a mean of {length} entries wants covariances ({length}, {length}), got {cov.shape[-2:]}")
-    steps = np.sqrt(rule.spread_sq(length)) * np.swapaxes(cholesky(cov), -1, -2)
+    steps = np.sqrt(rule.spread_sq(length)) * np.swapaxes(cholesky(cov) if factor is None else factor, -1, -2)
     centre = mean[..., None, :]
     shape = np.broadcast_shapes((*mean.shape[:-1], length, length), steps.shape)
     full = np.broadcast_to(centre, (*shape[:-2], 1, length))
@@ -99,7 +101,12 @@ def combine(values: Array, rule: SigmaRule, length: int, beta: Array | None = No
 
 
 def unscented_transform(
-    mean: Array, cov: Array, function: Callable[[Array], Array], rule: SigmaRule, beta: Array | None = None
+    mean: Array,
+    cov: Array,
+    function: Callable[[Array], Array],
+    rule: SigmaRule,
+    beta: Array | None = None,
+    factor: Array | None = None,
 ) -> tuple[Array, Array]:
     """Mean and covariance of `function(x)` for x ~ N(mean, cov).
 
@@ -113,6 +120,8 @@ def unscented_transform(
         Spread and weights.
     beta
         (...) overrides the rule's, one for each distribution.
+    factor
+        (..., L, L), any F with F F' = cov; None: the Cholesky factor. A symmetric root allows a singular covariance.
 
     Returns
     -------
@@ -125,7 +134,7 @@ def unscented_transform(
     ParameterError
         Shapes do not fit.
     """
-    points = sigma_points(mean, cov, rule)
+    points = sigma_points(mean, cov, rule, factor)
     return combine(np.asarray(function(points), float), rule, points.shape[-1], beta)
 
 

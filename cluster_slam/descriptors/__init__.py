@@ -13,6 +13,7 @@ from cluster_slam.descriptors.invariants import (
 )
 from cluster_slam.descriptors.members import block_diagonal, checked_points, isotropic
 from cluster_slam.descriptors.moments import (
+    carry,
     closed_form_moments,
     descriptor_moments,
     inertia_and_mean_distance,
@@ -44,6 +45,7 @@ __all__ = [
     "UnscentedDescriptor",
     "block_diagonal",
     "calibrated_threshold",
+    "carry",
     "checked_points",
     "closed_form_moments",
     "compare_vectors",

@@ -9,17 +9,16 @@ import numpy as np
 
 from cluster_slam.descriptors.members import centred, checked_points
 from cluster_slam.descriptors.moments import (
+    carry,
     closed_form_moments,
     descriptor_moments,
     inertia_and_mean_distance,
-    inertia_beta,
 )
 from cluster_slam.descriptors.protocol import Comparison, Description, compare_vectors
 from cluster_slam.geometry import Array
-from tracking.unscented import SigmaRule, unscented_transform
+from tracking.unscented import SigmaRule
 
 PAPER_RULE = SigmaRule(alpha=1.0, beta=2.0, kappa=0.0)
-TRUE_RULE = SigmaRule(alpha=1.0, beta=0.0, kappa=0.0)  # its beta is replaced by the one that makes var(I) exact
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +34,8 @@ class InertiaDistance:
             mean, out = descriptor_moments(points, cov)
         else:
             mean, out = closed_form_moments(points, np.sqrt(var))
-        return _reduced(mean, out, np.shape(points)[-2])
+        points = checked_points(points)
+        return _reduced(inertia_and_mean_distance(points), mean, out, points.shape[-2])
 
     def compare(self, reference: Description, observed: Description) -> Comparison:
         """Gaussian difference."""
@@ -53,14 +53,10 @@ class UnscentedDescriptor:
 
     def describe(self, points: Array, cov: Array) -> Description:
         """Mean and covariance of the function's value."""
-        offsets = centred(checked_points(points))
-        n = offsets.shape[-2]
-        cov = np.asarray(cov, float)
-        rule = TRUE_RULE if self.rule is None else self.rule
-        beta = inertia_beta(cov, rule) if self.rule is None else None
-        flat = offsets.reshape(*offsets.shape[:-2], 3 * n)
-        mean, out = unscented_transform(flat, cov, lambda x: self.function(x.reshape(*x.shape[:-1], n, 3)), rule, beta)
-        return Description(mean, out, self.dof(n), n)
+        points = checked_points(points)
+        n = points.shape[-2]
+        mean, out = carry(points, cov, self.function, self.rule)
+        return Description(self.function(centred(points)), mean, out, self.dof(n), n)
 
     def compare(self, reference: Description, observed: Description) -> Comparison:
         """Gaussian difference."""
@@ -101,8 +97,8 @@ def common_variance(cov: Array) -> Array | None:
     return var if bool((off <= 1e-12 * np.abs(var)).all()) else None
 
 
-def _reduced(mean: Array, cov: Array, n: int) -> Description:
+def _reduced(value: Array, mean: Array, cov: Array, n: int) -> Description:
     """Two members have one distance only, and inertia says nothing more."""
     if n == 2:
-        return Description(mean[..., 1:], cov[..., 1:, 1:], 1, n)
-    return Description(mean, cov, 2, n)
+        return Description(value[..., 1:], mean[..., 1:], cov[..., 1:, 1:], 1, n)
+    return Description(value, mean, cov, 2, n)

@@ -5,13 +5,18 @@ Descriptor (Chu et al. 2025, eqs. 4, 5): I = sum_i |p_i - c|^2 and D = (1/n) sum
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from cluster_slam.descriptors.members import centred, centred_cov, checked_points, checked_sigma, member_blocks
 from cluster_slam.descriptors.norms import Length, RadialLength, length, radial_length
 from cluster_slam.geometry import Array
-from tracking.gaussian import ensure_positive_semidefinite
+from tracking.gaussian import ensure_positive_semidefinite, symmetric_root
 from tracking.unscented import SigmaRule, unscented_transform
+
+TRUE_RULE = SigmaRule(alpha=1.0, beta=0.0, kappa=0.0)  # its beta gives way to the one that makes var(I) exact
+MEMBERS = "covariance of the members"
 
 
 def inertia_and_mean_distance(points: Array) -> Array:
@@ -21,25 +26,30 @@ def inertia_and_mean_distance(points: Array) -> Array:
     return np.stack([squares.sum(-1), np.sqrt(squares).mean(-1)], axis=-1)
 
 
-def inertia_beta(cov: Array, rule: SigmaRule) -> Array:
-    """The beta (...) that makes the unscented variance of the inertia exact, for joint covariances P (..., 3 n, 3 n).
+def inertia_beta(factor: Array, rule: SigmaRule) -> Array:
+    """The beta (...) that makes the unscented variance of the inertia exact.
 
-    The inertia is x' A x with A the centring matrix. Its variance is 4 u' A P A u + 2 tr(A P A P); the transform
-    gives 4 u' A P A u + h^2 sum_j q_j^2 + (beta - alpha^2) (sum_j q_j)^2 with q_j = c_j' A c_j and the columns c_j of
-    the Cholesky factor. For equal isotropic members this is 2 / (3 (n - 1)), for every alpha.
+    With y ~ N(u, F F') the members relative to the centroid, the inertia y'y has the variance 4 u'F F'u + 2 |F'F|^2;
+    the transform gives 4 u'F F'u + h^2 sum_j q_j^2 + (beta - alpha^2) (sum_j q_j)^2 with q_j the squares of F's columns
+    and h^2 = alpha^2 (L + kappa). For equal isotropic members beta is 2 / (3 (n - 1)), whatever alpha.
+
+    Parameters
+    ----------
+    factor
+        F (..., 3 n, 3 n), relative to the centroid.
     """
-    length = cov.shape[-1]
-    factor = np.linalg.cholesky(cov).reshape(*cov.shape[:-2], length // 3, 3, length)
-    factor = (factor - factor.mean(-3, keepdims=True)).reshape(cov.shape)
     q = (factor * factor).sum(-2)
     inner = np.swapaxes(factor, -1, -2) @ factor
     true_part = 2.0 * (inner * inner).sum((-1, -2))
-    beta: Array = (true_part - rule.spread_sq(length) * (q * q).sum(-1)) / q.sum(-1) ** 2 + rule.alpha**2
+    spread_sq = rule.spread_sq(factor.shape[-1])
+    beta: Array = (true_part - spread_sq * (q * q).sum(-1)) / q.sum(-1) ** 2 + rule.alpha**2
     return beta
 
 
-def unscented_moments(points: Array, cov: Array, rule: SigmaRule | None = None) -> tuple[Array, Array]:
-    """Mean (..., 2) and covariance (..., 2, 2) of inertia and mean distance, by the unscented transform.
+def carry(
+    points: Array, cov: Array, function: Callable[[Array], Array], rule: SigmaRule | None = None
+) -> tuple[Array, Array]:
+    """Mean and covariance of any function of the offsets from the centroid, by the unscented transform.
 
     Parameters
     ----------
@@ -47,27 +57,38 @@ def unscented_moments(points: Array, cov: Array, rule: SigmaRule | None = None) 
         (..., n, 3), any frame, m.
     cov
         Joint covariance of the members (..., 3 n, 3 n), m^2, in the same frame.
+    function
+        Takes offsets (..., n, 3), gives values (..., m).
     rule
-        As in the paper: `SigmaRule(alpha, beta, kappa)`. None: alpha 1, kappa 0 and the beta of `inertia_beta`, with
-        which the variance of the inertia is exact.
+        As in the paper: sigma points around the members. None: around the members relative to their centroid, so that
+        an error which all share changes nothing, with the beta of `inertia_beta`.
 
     Raises
     ------
     InputError
         Fewer than two flowers or a position that is not finite.
     CovarianceError
-        A covariance is not positive definite.
+        A covariance is not positive definite (None: semidefinite).
     """
     offsets = centred(checked_points(points))
     n = offsets.shape[-2]
-    used = SigmaRule() if rule is None else rule
     flat = offsets.reshape(*offsets.shape[:-2], 3 * n)
-    beta = inertia_beta(np.asarray(cov, float), used) if rule is None else None
+    cov = np.asarray(cov, float)
 
-    def describe(x: Array) -> Array:
-        return inertia_and_mean_distance(x.reshape(*x.shape[:-1], n, 3))
+    def of_flat(x: Array) -> Array:
+        return function(centred(x.reshape(*x.shape[:-1], n, 3)))
 
-    return unscented_transform(flat, np.asarray(cov, float), describe, used, beta)
+    if rule is not None:
+        return unscented_transform(flat, cov, of_flat, rule)
+    ensure_positive_semidefinite(cov, MEMBERS)
+    own = centred_cov(cov)
+    factor = symmetric_root(own, MEMBERS)
+    return unscented_transform(flat, own, of_flat, TRUE_RULE, inertia_beta(factor, TRUE_RULE), factor)
+
+
+def unscented_moments(points: Array, cov: Array, rule: SigmaRule | None = None) -> tuple[Array, Array]:
+    """Mean (..., 2) and covariance (..., 2, 2) of inertia and mean distance, by `carry`."""
+    return carry(points, cov, inertia_and_mean_distance, rule)
 
 
 def descriptor_moments(points: Array, cov: Array) -> tuple[Array, Array]:
@@ -92,7 +113,7 @@ def descriptor_moments(points: Array, cov: Array) -> tuple[Array, Array]:
     """
     offsets = centred(checked_points(points))
     n = offsets.shape[-2]
-    P = centred_cov(ensure_positive_semidefinite(cov, "covariance of the members"))
+    P = centred_cov(ensure_positive_semidefinite(cov, MEMBERS))
     flat = offsets.reshape(*offsets.shape[:-2], 3 * n)
     P_flat = (P @ flat[..., None])[..., 0]
     own = member_blocks(P)

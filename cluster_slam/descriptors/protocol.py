@@ -18,15 +18,21 @@ from tracking.gaussian import LOG_2PI, log_det
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Description:
-    """A descriptor's value for a stack of clusters with equal numbers of members."""
+    """A descriptor's value for a stack of clusters with equal numbers of members.
 
-    mean: Array  # (..., m)
+    Two observations with errors of like size are compared value against value: the errors shift both alike. An
+    observation of a cluster that is known far better is held against the *mean* that its errors let one expect
+    (`descriptor_moments` of the known positions with the sum of both covariances).
+    """
+
+    value: Array  # (..., m) at the members' positions as they were observed
+    mean: Array  # (..., m) expected where these positions are true and errors of `cov` are added
     cov: Array  # (..., m, m)
     dof: int  # degrees of freedom of the squared distance of two equal clusters
     n_flowers: int
 
     def __getitem__(self, index: int | slice | IntArray) -> Description:
-        return Description(self.mean[index], self.cov[index], self.dof, self.n_flowers)
+        return Description(self.value[index], self.mean[index], self.cov[index], self.dof, self.n_flowers)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,12 +66,12 @@ def compare_vectors(reference: Description, observed: Description) -> Comparison
     InputError
         The vectors differ in length, as they do for some descriptors where the numbers of members differ.
     """
-    if reference.mean.shape[-1] != observed.mean.shape[-1]:
+    if reference.value.shape[-1] != observed.value.shape[-1]:
         raise InputError(
             f"descriptions of {reference.n_flowers} and {observed.n_flowers} flowers differ in length: "
             "compare equal numbers of members (`compare_with_missing`)"
         )
-    innovation, S = observed.mean - reference.mean, reference.cov + observed.cov
+    innovation, S = observed.value - reference.value, reference.cov + observed.cov
     distance_sq = mahalanobis_sq(innovation, S)
     m = innovation.shape[-1]
     log_likelihood = -0.5 * (distance_sq + log_det(S) + m * LOG_2PI)

@@ -29,14 +29,14 @@ class FullGeometry:
         n = offsets.shape[-2]
         flat = offsets.reshape(*offsets.shape[:-2], 3 * n)
         full = np.broadcast_to(ensure_positive_definite(cov, "covariance of the members"), (*flat.shape, 3 * n))
-        return Description(flat, full, degrees_of_freedom(n), n)
+        return Description(flat, flat, full, degrees_of_freedom(n), n)
 
     def compare(self, reference: Description, observed: Description) -> Comparison:
         """Best map and motion of each pair; members may be missing on one side."""
         n, m = reference.n_flowers, observed.n_flowers
-        shape = np.broadcast_shapes(reference.mean.shape[:-1], observed.mean.shape[:-1])
-        a = np.broadcast_to(reference.mean, (*shape, 3 * n)).reshape(-1, n, 3)
-        b = np.broadcast_to(observed.mean, (*shape, 3 * m)).reshape(-1, m, 3)
+        shape = np.broadcast_shapes(reference.value.shape[:-1], observed.value.shape[:-1])
+        a = np.broadcast_to(reference.value, (*shape, 3 * n)).reshape(-1, n, 3)
+        b = np.broadcast_to(observed.value, (*shape, 3 * m)).reshape(-1, m, 3)
         cov_a = np.broadcast_to(reference.cov, (*shape, 3 * n, 3 * n)).reshape(-1, 3 * n, 3 * n)
         cov_b = np.broadcast_to(observed.cov, (*shape, 3 * m, 3 * m)).reshape(-1, 3 * m, 3 * m)
         var_a, var_b = common_variance(cov_a), common_variance(cov_b)
