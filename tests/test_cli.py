@@ -114,7 +114,7 @@ def test_smooth_writes_a_result_and_tells_about_it(
 ) -> None:
     assert run(["smooth", str(session), "-o", str(tmp_path / "out"), "--seed", "4"]) == 0
     printed = capsys.readouterr().out
-    for word in ("frames", "60", "clusters", "clutter", "hand-eye", "cluster_idf1", "report.html"):
+    for word in ("frames", "60", "clusters", "clutter", "hand-eye", "IDF1 of clusters 0.", "report.html"):
         assert word in printed
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names >= {"trajectory.txt", "observations.csv", "clusters.csv", "flowers.csv", "drift.csv"}

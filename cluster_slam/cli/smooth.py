@@ -20,27 +20,13 @@ from cluster_slam.cli.options import (
     configured,
 )
 from cluster_slam.cli.progress import StageProgress
-from cluster_slam.cli.summary import metric_rows, print_json, print_table, print_warnings, result_rows
+from cluster_slam.cli.summary import print_json, print_table, print_warnings, result_rows, truth_rows
 from cluster_slam.config import SmoothConfig
 from cluster_slam.errors import ConfigError
 
 if TYPE_CHECKING:
     from cluster_slam.evaluation import Metrics
     from cluster_slam.records import Result, Session, Truth
-
-SHOWN_METRICS = (
-    "ate_rmse_m",
-    "ate_rotation_rad",
-    "cluster_idf1",
-    "flower_idf1",
-    "clutter_precision",
-    "clutter_recall",
-    "flower_rmse_m",
-    "nees_flowers",
-    "nees_clusters",
-    "hand_eye_m",
-    "hand_eye_rad",
-)
 
 
 def command(
@@ -143,6 +129,5 @@ def _work(
 
 def _tell(result: Result, metrics: Mapping[str, float], out: Path, seconds: float) -> None:
     print_warnings(result.warnings)
-    shown = {name: metrics[name] for name in SHOWN_METRICS if name in metrics}
     ends = [("time", f"{seconds:.1f} s"), ("report", str(out / "report.html"))]
-    print_table(f"cluster-slam smooth: {result.status}", [*result_rows(result), *metric_rows(shown), *ends])
+    print_table(f"cluster-slam smooth: {result.status}", [*result_rows(result), *truth_rows(metrics), *ends])

@@ -11,6 +11,14 @@ if TYPE_CHECKING:
     from cluster_slam.records import Result
 
 _LENGTHS = {"_m": (1e3, "mm"), "_rad": (57.29577951308232, "deg")}  # unit of a name's ending: factor, unit shown
+_SUBJECTS = (
+    ("trajectory error", (("ate_rmse_m", 1e3, "{:.3g} mm"), ("ate_rotation_rad", 57.2958, "{:.3g} deg RMS"))),
+    ("identities", (("cluster_idf1", 1, "IDF1 of clusters {:.4f}"), ("flower_idf1", 1, "of flowers {:.4f}"))),
+    ("clutter labels", (("clutter_precision", 1, "precision {:.3f}"), ("clutter_recall", 1, "recall {:.3f}"))),
+    ("flower error", (("flower_rmse_m", 1e3, "{:.3g} mm RMS"),)),
+    ("NEES (1 is true)", (("nees_flowers", 1, "flowers {:.3g}"), ("nees_clusters", 1, "clusters {:.3g}"))),
+    ("hand-eye error", (("hand_eye_m", 1e3, "{:.3g} mm"), ("hand_eye_rad", 57.2958, "{:.3g} deg"))),
+)  # a row of the summary: metric, factor to the unit shown, words
 
 
 def print_json(value: Mapping[str, Any]) -> None:
@@ -66,6 +74,16 @@ def _hand_eye_row(result: Result) -> list[tuple[str, str]]:
     text = f"moved by {1e3 * shift:.2f} mm and {np.degrees(turn):.3f} deg from what was measured"
     unobserved = result.calibration.unobserved
     return [("hand-eye", text + (f"; not observable: {', '.join(unobserved)}" if unobserved else ""))]
+
+
+def truth_rows(metrics: Mapping[str, float]) -> list[tuple[str, str]]:
+    """The main metrics in words, one row a subject; what is not known is left out."""
+    rows = []
+    for subject, parts in _SUBJECTS:
+        texts = [words.format(metrics[name] * factor) for name, factor, words in parts if name in metrics]
+        if texts:
+            rows.append((subject, ", ".join(texts)))
+    return rows
 
 
 def metric_rows(metrics: Mapping[str, float]) -> list[tuple[str, str]]:
