@@ -51,6 +51,18 @@ class TemplateConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class ParticleConfig:
+    """Options of the association where poses drift."""
+
+    n_particles: int = 200
+    odometry_factors: tuple[float, ...] = (1.0, 3.0, 10.0)  # of the stated sigmas: wheels slip, clocks are late
+    odometry_shares: tuple[float, ...] = (0.6, 0.3, 0.1)  # of the particles that draw each factor
+    gate_chi2: float = 25.0  # 3 degrees of freedom
+    new_chi2: float = 14.0  # a new landmark is as likely as a match that fits so badly
+    least_share: float = 0.5  # of effective particles; below that they are drawn anew
+
+
+@dataclass(frozen=True, slots=True)
 class SmoothConfig:
     """Options of ``smooth``."""
 
@@ -59,6 +71,7 @@ class SmoothConfig:
     min_observations: int = 8  # of a confirmed flower; fewer where the session has few frames
     tracklets: TrackletConfig = field(default_factory=TrackletConfig)
     follow: TemplateConfig = field(default_factory=TemplateConfig)
+    particles: ParticleConfig = field(default_factory=ParticleConfig)
     grouping: GroupingConfig = field(default_factory=GroupingConfig)
 
 

@@ -23,6 +23,9 @@ def pose_model(session: Session) -> PoseModel:
             np.hypot(noise.pose_rotation, noise.odometry_rotation * turned),
             np.hypot(noise.pose_translation, noise.odometry_translation * travelled),
         )
+        axis = planar_axis(moved)
+        if axis is not None:
+            step = _in_plane(step, axis)
     return PoseModel(
         given=session.poses,
         cov=_diagonal(np.array(noise.pose_rotation), np.array(noise.pose_translation)),
@@ -30,6 +33,28 @@ def pose_model(session: Session) -> PoseModel:
         X0=session.T_flange_camera,
         cov_hand_eye=_diagonal(np.array(noise.hand_eye_rotation), np.array(noise.hand_eye_translation)),
     )
+
+
+def planar_axis(moved: Array, tolerance: float = 1e-5) -> Array | None:
+    """Axis (3,) about which all motions (n, 6) turn and across which all move: a vehicle on a floor; None if none.
+
+    Only poses that were computed in a plane pass so exactly; a measured 3-D motion never does.
+    """
+    size = np.abs(moved).max(initial=0.0)
+    if size == 0.0:
+        return None
+    axis = np.linalg.svd(moved[:, :3], full_matrices=False)[2][0]
+    off = np.concatenate([moved[:, :3] - np.outer(moved[:, :3] @ axis, axis), (moved[:, 3:] @ axis)[:, None]], axis=1)
+    return axis if np.abs(off).max() < tolerance * size else None
+
+
+def _in_plane(cov: Array, axis: Array) -> Array:
+    """Covariances (n, 6, 6) with the motions out of the plane of ``axis`` known to all but a rest."""
+    along = np.outer(axis, axis)
+    keep = np.zeros((6, 6))
+    keep[:3, :3], keep[3:, 3:] = along, np.eye(3) - along
+    rest: Array = keep @ cov @ keep.T + _LEAST_SIGMA**2 * np.eye(6)
+    return rest
 
 
 def camera_covs(model: PoseModel, X: Array | None) -> tuple[Array, Array | None]:
