@@ -1,0 +1,59 @@
+"""Smoothing with the true association: what anybody could reach who was told which detection is which flower."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from cluster_slam import pipeline
+from cluster_slam.association.frames import sort_by_frame
+from cluster_slam.config import SmoothConfig
+from cluster_slam.evaluation.trajectory import hand_eye_truth
+from cluster_slam.graph.noise import pose_model
+from cluster_slam.records import Result, Session, Truth
+
+
+def smooth_with_truth(session: Session, truth: Truth, config: SmoothConfig | None = None) -> Result:
+    """The pipeline's own smoothing, given the true labels and started at the truth, so that it cannot get lost."""
+    assert truth.flower_ids is not None
+    assert truth.T_world_camera is not None
+    config = config or SmoothConfig()
+    frames = sort_by_frame(session.observations, session.stamps)
+    model = pose_model(session)
+    ids, landmark, cluster = _true_landmarks(truth, frames.order)
+    true_hand_eye = hand_eye_truth(session, truth)
+    world = pipeline._World(
+        T=truth.T_world_camera,
+        X=None if session.T_flange_camera is None or true_hand_eye is None else true_hand_eye.T_flange_camera,
+        landmark=landmark,
+        places=_true_places(truth, ids),
+        cluster=cluster,
+        radius=1.0,
+    )
+    for _ in range(2):  # the second time with the displacements that the first found
+        smoother, estimate = pipeline._smooth(frames, model, world, config, 8)
+        world = replace(world, T=estimate.T, X=estimate.X, places=estimate.places)
+    marginals = smoother.marginals(estimate)
+    return pipeline._result(session, frames, world, smoother, estimate, marginals, config, 0, [], {})
+
+
+def _true_landmarks(truth: Truth, order: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """True flower ids that were seen (l,), landmark of each sorted observation, cluster of each landmark."""
+    assert truth.flower_ids is not None
+    assert truth.cluster_ids is not None
+    flower, cluster_of = truth.flower_ids[order], truth.cluster_ids[order]
+    seen = flower >= 0
+    ids, first, inverse = np.unique(flower[seen], return_index=True, return_inverse=True)
+    landmark = np.full(len(flower), -1, dtype=np.int64)
+    landmark[seen] = inverse
+    _, cluster = np.unique(cluster_of[seen][first], return_inverse=True)
+    return ids, landmark, cluster
+
+
+def _true_places(truth: Truth, ids: np.ndarray) -> np.ndarray:
+    assert truth.rest_flower_ids is not None
+    assert truth.rest_positions is not None
+    order = np.argsort(truth.rest_flower_ids)
+    places: np.ndarray = truth.rest_positions[order[np.searchsorted(truth.rest_flower_ids[order], ids)]]
+    return places
