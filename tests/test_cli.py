@@ -22,6 +22,7 @@ from cluster_slam.cli.app import main, run
 from cluster_slam.cli.options import configured
 from cluster_slam.cli.progress import StageProgress
 from cluster_slam.cli.smooth import smooth_config
+from cluster_slam.cli.summary import shown_metric
 from cluster_slam.config import GroupingConfig, SmoothConfig
 from cluster_slam.errors import ConfigError
 from cluster_slam.io.session import open_session
@@ -310,6 +311,19 @@ def test_reproduce_says_whether_the_table_is_exact(
     printed = capsys.readouterr()
     assert json.loads(printed.out) == {"out": "x", "is_table1_exact": is_exact}
     assert ("not as printed" in printed.err) == (code == 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("ate_rmse_m", 0.00123, "1.23 mm"),
+        ("ate_rmse_m", 1.99, "1.99 m"),
+        ("hand_eye_rad", 0.0174533, "1 deg"),
+        ("cluster_idf1", 0.99981, "0.9998"),
+    ],
+)
+def test_metrics_are_shown_with_their_unit(name: str, value: float, text: str) -> None:
+    assert shown_metric(name, value) == text
 
 
 def test_check_says_what_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,15 +10,23 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from cluster_slam.records import Result
 
-_LENGTHS = {"_m": (1e3, "mm"), "_rad": (57.29577951308232, "deg")}  # unit of a name's ending: factor, unit shown
-_SUBJECTS = (
-    ("trajectory error", (("ate_rmse_m", 1e3, "{:.3g} mm"), ("ate_rotation_rad", 57.2958, "{:.3g} deg RMS"))),
-    ("identities", (("cluster_idf1", 1, "IDF1 of clusters {:.4f}"), ("flower_idf1", 1, "of flowers {:.4f}"))),
-    ("clutter labels", (("clutter_precision", 1, "precision {:.3f}"), ("clutter_recall", 1, "recall {:.3f}"))),
-    ("flower error", (("flower_rmse_m", 1e3, "{:.3g} mm RMS"),)),
-    ("NEES (1 is true)", (("nees_flowers", 1, "flowers {:.3g}"), ("nees_clusters", 1, "clusters {:.3g}"))),
-    ("hand-eye error", (("hand_eye_m", 1e3, "{:.3g} mm"), ("hand_eye_rad", 57.2958, "{:.3g} deg"))),
-)  # a row of the summary: metric, factor to the unit shown, words
+_ROWS = (
+    ("trajectory error", (("ate_rmse_m", "{}"), ("ate_rotation_rad", "{} RMS"))),
+    ("identities", (("cluster_idf1", "IDF1 of clusters {}"), ("flower_idf1", "of flowers {}"))),
+    ("clutter labels", (("clutter_precision", "precision {}"), ("clutter_recall", "recall {}"))),
+    ("flower error", (("flower_rmse_m", "{} RMS"),)),
+    ("NEES (1 is true)", (("nees_flowers", "flowers {}"), ("nees_clusters", "clusters {}"))),
+    ("hand-eye error", (("hand_eye_m", "{}"), ("hand_eye_rad", "{}"))),
+)  # of the summary: each metric with its words
+
+
+def shown_metric(name: str, value: float) -> str:
+    """A metric with the unit that suits it, by the ending of its name."""
+    if name.endswith("_rad"):
+        return f"{57.29577951308232 * value:.3g} deg"
+    if name.endswith("_m"):
+        return f"{value:.3g} m" if value >= 1.0 else f"{1e3 * value:.3g} mm"
+    return f"{value:.4g}"
 
 
 def print_json(value: Mapping[str, Any]) -> None:
@@ -79,21 +87,13 @@ def _hand_eye_row(result: Result) -> list[tuple[str, str]]:
 def truth_rows(metrics: Mapping[str, float]) -> list[tuple[str, str]]:
     """The main metrics in words, one row a subject; what is not known is left out."""
     rows = []
-    for subject, parts in _SUBJECTS:
-        texts = [words.format(metrics[name] * factor) for name, factor, words in parts if name in metrics]
+    for subject, parts in _ROWS:
+        texts = [words.format(shown_metric(name, metrics[name])) for name, words in parts if name in metrics]
         if texts:
             rows.append((subject, ", ".join(texts)))
     return rows
 
 
 def metric_rows(metrics: Mapping[str, float]) -> list[tuple[str, str]]:
-    """Metrics by name, lengths in millimetres and angles in degrees."""
-    return [_metric(name, value) for name, value in metrics.items()]
-
-
-def _metric(name: str, value: float) -> tuple[str, str]:
-    for ending, (factor, unit) in _LENGTHS.items():
-        if name.endswith(ending):
-            what = "_rotation" if unit == "deg" and "rotation" not in name else ""
-            return name.removesuffix(ending) + what, f"{factor * value:.4g} {unit}"
-    return name, f"{value:.6g}"
+    """All metrics by the names that ``metrics.json`` has for them."""
+    return [(name, shown_metric(name, value)) for name, value in metrics.items()]
