@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from cluster_slam.descriptors.members import checked_points
 from cluster_slam.errors import InputError
 from cluster_slam.geometry import Array
-from cluster_slam.records import IntArray
 from tracking.gating import mahalanobis_sq
 from tracking.gaussian import LOG_2PI, log_det
 
@@ -31,7 +30,8 @@ class Description:
     dof: int  # degrees of freedom of the squared distance of two equal clusters
     n_flowers: int
 
-    def __getitem__(self, index: int | slice | IntArray) -> Description:
+    def __getitem__(self, index: Any) -> Description:
+        """Of some clusters of the stack, or with new axes; the last axes stay."""
         return Description(self.value[index], self.mean[index], self.cov[index], self.dof, self.n_flowers)
 
 
