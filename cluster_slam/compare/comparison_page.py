@@ -30,8 +30,8 @@ class Comparison:
 def render(done: Comparison, figure: bytes) -> str:
     """The page as HTML, with its figure inside."""
     intro = """Clusters whose flowers lie uniformly in a ball of 3 to 8 cm, no two nearer than 12 mm, each observed
-        twice with independent errors. False match rate: share of pairs of different clusters with as many flowers that are
-        accepted where 95 % of the true pairs are. Simulated unless said otherwise."""
+        twice with independent errors. False match rate: share of pairs of different clusters with as many flowers that
+        are accepted where 95 % of the true pairs are. Simulated unless said otherwise."""
     parts = [page.paragraph(intro), page.picture(figure, "The comparison in one figure"), *_rates(done.outcomes)]
     return page.page("Descriptors compared", [*parts, *_coverage(done.coverage), *_real(done)])
 
