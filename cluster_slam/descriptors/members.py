@@ -28,7 +28,7 @@ def checked_points(points: Array, minimum: int = 2) -> Array:
 
 def centred(points: Array) -> Array:
     """Points (..., n, 3) relative to their centroid."""
-    out: Array = points - points.mean(-2, keepdims=True)
+    out: Array = points - np.einsum("...ni->...i", points)[..., None, :] / points.shape[-2]
     return out
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import erf, erfc
+from scipy.special import erfc
 
 from cluster_slam.geometry import Array
 
@@ -47,12 +47,18 @@ def radial_length(m: Array, s: Array) -> RadialLength:
     """
     a = m / s
     small = a < SMALL
-    b = np.where(small, 1.0, a)
-    e, tail, bell = erf(b / np.sqrt(2.0)), erfc(b / np.sqrt(2.0)), SQRT_2_PI * np.exp(-0.5 * b * b)
-    excess = s * np.where(small, SQRT_2_PI * (2.0 + a * a / 3.0) - a, bell + e / b - b * tail)
-    ratio = np.where(small, SQRT_2_PI * (2.0 / 3.0 - a * a / 15.0), ((1.0 - 1.0 / b**2) * e + bell / b) / b) / s
-    inverse = np.where(small, SQRT_2_PI * (1.0 - a * a / 6.0), e / b) / s
-    return RadialLength(excess, ratio * m, ratio, 2.0 * inverse - 2.0 * ratio)
+    b = np.maximum(a, SMALL)
+    inverse_b = 1.0 / b
+    tail, bell = erfc(b * np.sqrt(0.5)), SQRT_2_PI * np.exp(-0.5 * b * b)
+    excess = bell + inverse_b - (b + inverse_b) * tail
+    inverse = (1.0 - tail) * inverse_b  # s E[1/|y|]
+    ratio = (1.0 - tail - inverse_b * inverse + bell * inverse_b) * inverse_b
+    if small.any():
+        excess = np.where(small, SQRT_2_PI * (2.0 + a * a / 3.0) - a, excess)
+        ratio = np.where(small, SQRT_2_PI * (2.0 / 3.0 - a * a / 15.0), ratio)
+        inverse = np.where(small, SQRT_2_PI * (1.0 - a * a / 6.0), inverse)
+    ratio = ratio / s
+    return RadialLength(s * excess, ratio * m, ratio, 2.0 * inverse / s - 2.0 * ratio)
 
 
 def length(u: Array, S: Array) -> Length:
