@@ -24,6 +24,7 @@ from cluster_slam.geometry import Array, transform
 from cluster_slam.graph.batch import BatchSmoother, Estimate, Marginals, Pairs, PoseModel
 from cluster_slam.graph.hand_eye import hand_eye_from_pieces
 from cluster_slam.graph.noise import camera_covs, pose_model
+from cluster_slam.graph.variance import VarianceFactors, correlation_at_given_poses, variance_factors
 from cluster_slam.grouping import Motion, group_flowers
 from cluster_slam.landmark_tables import RestMap, cluster_table, drift_table, flower_table
 from cluster_slam.records import Calibration, Diagnostics, IntArray, RejectReason, Result, Session
@@ -43,6 +44,8 @@ class _World:
     places: Array  # (l, 3)
     cluster: IntArray  # (l,)
     radius: float  # pieces of one flower lie within, m
+    noise: VarianceFactors  # what was found about the stated variances so far
+    least_correlation: float = 1.0  # so many observations in a row say the same thing, at least
 
 
 def smooth(
@@ -65,31 +68,71 @@ def smooth(
     say = progress or (lambda _stage, _fraction: None)
     rng = np.random.default_rng(seed)
     clock = _Clock()
-    frames = sort_by_frame(session.observations, session.stamps)
-    model = pose_model(session)
+    stated = sort_by_frame(session.observations, session.stamps)
+    stated_poses = pose_model(session)
     say("calibrating", 0.0)
-    world = _first_world(frames, model, config, rng)
+    world = _first_world(stated, stated_poses, config, rng)
     clock.lap("landmarks")
     merged: list[tuple[int, int]] = []
     for i in range(config.max_rounds):
+        frames, model = _with_variances(stated, stated_poses, world.noise)
         say(f"associating, round {i + 1}", 0.15 + 0.7 * i / config.max_rounds)
         before = world.landmark
         world = _associate(frames, model, world, config)
         clock.lap("association")
         say(f"smoothing, round {i + 1}", 0.15 + 0.7 * (i + 0.6) / config.max_rounds)
-        is_last = i + 1 == config.max_rounds or (i > 0 and float((world.landmark != before).mean()) < 5e-4)
+        is_last = (
+            len(frames) == 0
+            or i + 1 == config.max_rounds
+            or (i > 0 and int((world.landmark != before).sum()) < 5e-4 * len(before))
+        )
+        if i == 0 and model.cov_step is not None:
+            world = replace(world, least_correlation=_correlation_at_given_poses(frames, model, world))
         smoother, estimate = _smooth(frames, model, world, config, 3)
-        world = _regroup(frames, replace(world, T=estimate.T, X=estimate.X, places=estimate.places), config, rng)
+        world = _learn(world, smoother, estimate)
+        world = _regroup(frames, world, config, rng)
         clock.lap("smoothing")
         if is_last:
             break
         world, new = _mend(frames, model, world, estimate, smoother.pairs, config)
         merged += new
+    world = _drop_unsupported(stated, world, config)
     say("smoothing all", 0.85)
-    smoother, estimate = _smooth(frames, model, world, config, 8)
+    for _ in range(2):
+        frames, model = _with_variances(stated, stated_poses, world.noise)
+        smoother, estimate = _smooth(frames, model, world, config, 6)
+        known, world = world.noise, _learn(world, smoother, estimate)
+        if abs(np.log(world.noise.flower / known.flower)) + abs(np.log(world.noise.pose / known.pose)) < 0.1:
+            break
     marginals = smoother.marginals(estimate)
     clock.lap("smoothing")
     return _result(session, frames, world, smoother, estimate, marginals, config, seed, merged, clock.laps)
+
+
+def _with_variances(frames: Frames, model: PoseModel, noise: VarianceFactors) -> tuple[Frames, PoseModel]:
+    """The session with the variances that were found instead of those that are stated."""
+    return replace(frames, covs=frames.covs * noise.flower), replace(model, cov=model.cov * noise.pose)
+
+
+def _learn(world: _World, smoother: BatchSmoother, estimate: Estimate) -> _World:
+    """Take over what the smoothing found: poses, hand-eye transform, places, and how large the errors really are."""
+    found = variance_factors(smoother, estimate)
+    noise = VarianceFactors(
+        world.noise.flower * found.flower,
+        world.noise.pose * found.pose,
+        max(found.correlation, world.least_correlation),
+    )
+    return replace(world, T=estimate.T, X=estimate.X, places=estimate.places, noise=noise)
+
+
+def _correlation_at_given_poses(frames: Frames, model: PoseModel, world: _World) -> float:
+    """How slowly the observations err if the odometry is believed as it is given."""
+    given = model.given if world.X is None else model.given @ world.X
+    w = transform(given[frames.frame], frames.points)
+    var = np.trace(frames.covs, axis1=1, axis2=2) / 3.0
+    places = group_means(w, var, world.landmark, len(world.places)).mean
+    smoother, start = _problem(frames, model, replace(world, T=given, places=places))
+    return correlation_at_given_poses(smoother, replace(start, d=np.zeros_like(start.d)))
 
 
 class _Clock:
@@ -105,41 +148,50 @@ class _Clock:
         self._last = now
 
 
-def _first_world(frames: Frames, model: PoseModel, config: SmoothConfig, rng: np.random.Generator) -> _World:
+def _first_world(stated: Frames, stated_poses: PoseModel, config: SmoothConfig, rng: np.random.Generator) -> _World:
     """Pieces, the hand-eye transform from them, landmarks from the pieces, and a first grouping."""
-    X, cov_X = model.X0, model.cov_hand_eye
-    var = _scalar_var(frames, model)
-    shortest = _shortest_piece(frames)
-    T, labels = model.given, np.full(len(frames), -1)
-    for _ in range(3 if X is not None else 1):
+    X, cov_X = stated_poses.X0, stated_poses.cov_hand_eye
+    noise = VarianceFactors(1.0, 1.0, 1.0)
+    shortest = _shortest_piece(stated)
+    for _ in range(3):
+        frames, model = _with_variances(stated, stated_poses, noise)
         T = model.given if X is None else model.given @ X
         cov, step = camera_covs(model, X)
         relative = relative_pose_cov(T, frames.stamps, cov, None if X is None else cov_X, step, 0.5)
-        labels = build_tracklets(frames, T, relative, config.tracklets).labels
-        if X is None or model.X0 is None:
+        pieces = build_tracklets(frames, T, relative, config.tracklets)
+        long = _in_long_pieces(pieces.labels, shortest)
+        factor = _innovation_factor(pieces.innovation_chi2[long])
+        noise = VarianceFactors(noise.flower * factor, noise.pose * factor, 1.0)
+        if model.X0 is not None and long.any():
+            X, data = hand_eye_from_pieces(
+                model.given[frames.frame[long]],
+                frames.points[long],
+                _scalar_var(frames, model)[long],
+                pieces.labels[long],
+                model.X0,
+                model.cov_hand_eye,
+            )
+            cov_X = np.linalg.inv(data + np.linalg.inv(model.cov_hand_eye))
+        elif factor == 1.0:
             break
-        long = _in_long_pieces(labels, shortest)
-        if not long.any():
-            break
-        X, data = hand_eye_from_pieces(
-            model.given[frames.frame[long]], frames.points[long], var[long], labels[long], model.X0, model.cov_hand_eye
-        )
-        cov_X = np.linalg.inv(data + np.linalg.inv(model.cov_hand_eye))
     T = model.given if X is None else model.given @ X
-    w = transform(T[frames.frame], frames.points)
+    w, var, labels = transform(T[frames.frame], frames.points), _scalar_var(frames, model), pieces.labels
     radius = 0.65 * _spacing(frames, w, var, labels, shortest)
     landmark, places = merge_pieces(w, var, labels, frames.frame, frames.n_frames, radius, shortest)
     keep = supported(frames, T, places, landmark, _minimum(frames, config))
     landmark, places = _keep(keep, landmark, places)
     presence = presence_of(frames.frame, landmark, len(places), frames.n_frames)
-    return _World(
-        T,
-        X,
-        landmark,
-        places,
-        group_flowers(places, presence, None, view_volume(frames), config.grouping, rng=rng),
-        radius,
-    )
+    cluster = group_flowers(places, presence, None, view_volume(frames), config.grouping, rng=rng)
+    return _World(T, X, landmark, places, cluster, radius, noise)
+
+
+def _innovation_factor(chi2: Array) -> float:
+    """Factor on the stated variances that innovations of pieces ask for; one where they are about right."""
+    chi2 = chi2[np.isfinite(chi2)]
+    if len(chi2) < 50:
+        return 1.0
+    factor = float(np.median(chi2)) / chi2_threshold(3, 0.5)
+    return factor if factor > 1.6 else 1.0  # errors that change slowly hide from innovations: never narrower here
 
 
 def _scalar_var(frames: Frames, model: PoseModel) -> Array:
@@ -195,17 +247,28 @@ def _associate(frames: Frames, model: PoseModel, world: _World, config: SmoothCo
     landmark = np.empty(len(frames), dtype=np.int64)
     landmark[back.order] = backward.landmark
     backward = replace(backward, landmark=landmark, score=backward.score[::-1])
-    return replace(world, landmark=combine_directions(forward, backward, frames, world.cluster))
+    landmark = combine_directions(forward, backward, frames, world.cluster)
+    keep = np.bincount(landmark[landmark >= 0], minlength=len(world.places)) > 0
+    _, cluster = np.unique(world.cluster[keep], return_inverse=True)
+    return replace(world, landmark=compact(keep, landmark), places=world.places[keep], cluster=cluster)
 
 
 def _smooth(
     frames: Frames, model: PoseModel, world: _World, config: SmoothConfig, n_iterations: int
 ) -> tuple[BatchSmoother, Estimate]:
     """Solve for poses, hand-eye transform, flowers and displacements, the association given."""
+    smoother, start = _problem(frames, model, world)
+    return smoother, smoother.solve(start, chi2_threshold(3, config.outlier_probability), n_iterations)
+
+
+def _problem(frames: Frames, model: PoseModel, world: _World) -> tuple[BatchSmoother, Estimate]:
+    """The graph of the session and where its solution starts."""
     of, frame, cluster = cluster_pairs(frames, world.landmark, world.cluster)
     d, cov = measured_displacements(frames, world.T, world.landmark, world.places, of, len(frame))
     pose_var = model.cov[3, 3] + model.cov[0, 0] * float(np.median((frames.points**2).sum(axis=1), keepdims=False))
     scale = motion_scale(d, cov + pose_var * np.eye(3), frame, cluster, frames.stamps)
+    if np.bincount(world.cluster, minlength=1).max(initial=0) < 2:
+        scale = np.zeros_like(scale)  # flowers that stand alone tell no sway from errors of their own
     pairs = Pairs(
         of=of,
         frame=frame,
@@ -222,8 +285,8 @@ def _smooth(
         weight=(world.landmark >= 0).astype(float),
         residual_chi2=np.full(len(frames), np.nan),
     )
-    smoother = BatchSmoother(frames, model, world.landmark, pairs)
-    return smoother, smoother.solve(start, chi2_threshold(3, config.outlier_probability), n_iterations)
+    correlation = max(world.noise.correlation, world.least_correlation)
+    return BatchSmoother(frames, model, world.landmark, pairs, correlation), start
 
 
 def _regroup(frames: Frames, world: _World, config: SmoothConfig, rng: np.random.Generator) -> _World:
@@ -242,11 +305,20 @@ def _regroup(frames: Frames, world: _World, config: SmoothConfig, rng: np.random
     )
 
 
+def _drop_unsupported(frames: Frames, world: _World, config: SmoothConfig) -> _World:
+    """Leave out what the last association does not support."""
+    keep = supported(frames, world.T, world.places, world.landmark, _minimum(frames, config))
+    _, cluster = np.unique(world.cluster[keep], return_inverse=True)
+    return replace(world, landmark=compact(keep, world.landmark), places=world.places[keep], cluster=cluster)
+
+
 def _mend(
     frames: Frames, model: PoseModel, world: _World, estimate: Estimate, pairs: Pairs, config: SmoothConfig
 ) -> tuple[_World, list[tuple[int, int]]]:
     """Merge ghosts, drop what too few observations support, and look for flowers that were overlooked."""
-    landmark, merged = merge_ghosts(world.places, world.landmark, frames, 0.6 * world.radius)
+    sigma = float(np.sqrt(np.median(_scalar_var(frames, model))))
+    duplicate_radius = max(0.6 * world.radius, 4.0 * sigma)
+    landmark, merged = merge_ghosts(world.places, world.landmark, frames, duplicate_radius)
     keep = supported(frames, world.T, world.places, landmark, _minimum(frames, config))
     displacement = np.full((frames.n_frames, int(pairs.cluster.max(initial=0)) + 1, 3), np.nan)
     displacement[pairs.frame, pairs.cluster] = estimate.d
@@ -264,6 +336,7 @@ def _mend(
         displacement,
         owner,
         world.radius,
+        duplicate_radius,
         min(14, max(_minimum(frames, config), 1)),
         config.tracklets,
     )
@@ -298,6 +371,7 @@ def _result(
     rest = RestMap(estimate.places, marginals.places, world.cluster, world.landmark)
     flowers = flower_table(rest, frames)
     n_clusters = int(world.cluster.max(initial=-1)) + 1
+    warnings = _shortcomings(session, frames, world)
     confirmed = np.zeros(n_clusters, dtype=bool)
     np.logical_or.at(confirmed, world.cluster, flowers.n_observations >= _minimum(frames, config))
     clusters = cluster_table(rest, frames, confirmed)
@@ -337,6 +411,19 @@ def _result(
             "clutter": int((world.landmark < 0).sum()),
             "outliers": int((np.nan_to_num(estimate.residual_chi2) > threshold).sum()),
         },
-        warnings=session.warnings,
+        warnings=(*session.warnings, *warnings),
         merged=tuple(merged),
+        status="poor" if warnings else "ok",
     )
+
+
+def _shortcomings(session: Session, frames: Frames, world: _World) -> tuple[str, ...]:
+    """Why the result is poor, in words; empty where it is not."""
+    if len(frames) == 0:
+        return ("no flowers in the session: there is nothing to find",)
+    if len(world.places) == 0:
+        return (f"none of the {len(frames)} observations was seen again: no flower could be confirmed",)
+    share = float((world.landmark >= 0).mean())
+    if share < 0.5:
+        return (f"only {100 * share:.0f} % of the observations belong to a flower: the rest was taken for false ones",)
+    return ()

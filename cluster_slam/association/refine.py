@@ -35,44 +35,51 @@ def merge_ghosts(
             keep, go = (a, b) if count[a] >= count[b] else (b, a)
             target[go] = keep
             merged.append((int(go), int(keep)))
-    return np.where(landmark >= 0, target[landmark], -1), merged
+    return np.append(target, -1)[landmark], merged
 
 
 def supported(
-    frames: Frames, T: Array, places: Array, landmark: IntArray, minimum: int, least_share: float = 0.2
+    frames: Frames, T: Array, places: Array, landmark: IntArray, minimum: int, least_share: float = 0.12
 ) -> Array:
     """Which landmarks (l,) are believed: often enough seen at all, and in enough of the frames that looked at them.
 
-    Flowers are seen in about the same share of the frames in which they are in view. What is seen in less than
-    ``least_share`` of that (the place of a flower during a shake, a false detection that came twice) is none.
+    A frame looked at a place if it was in the field of view and one of the landmarks next to it was seen (so nothing
+    stood before it). What is seen in less than ``least_share`` of those, compared with the others, is none: the place
+    of a flower during a shake, a false detection that came twice.
     """
     count = np.bincount(landmark[landmark >= 0], minlength=len(places)).astype(float)
     if not count.any():
-        return count >= minimum
-    share = count / np.maximum(frames_in_view(frames, T, places), count)
+        return np.zeros(len(places), dtype=bool)
+    share = count / np.maximum(frames_that_looked(frames, T, places, landmark), count)
     order = np.argsort(share)
     usual = share[order][np.searchsorted(np.cumsum(count[order]), 0.5 * count.sum())]
     believed: Array = (count >= minimum) & (share >= least_share * usual)
     return believed
 
 
-def frames_in_view(frames: Frames, T: Array, places: Array) -> Array:
-    """Number of frames (l,) whose field of view holds each place (l, 3)."""
+def frames_that_looked(frames: Frames, T: Array, places: Array, landmark: IntArray, n_neighbours: int = 3) -> Array:
+    """Number of frames (l,) that had each place (l, 3) in view and saw one of the landmarks next to it."""
     low, high = field_of_view(frames)
-    total = np.zeros(len(places))
-    for chunk in np.array_split(np.arange(frames.n_frames), 1 + frames.n_frames // 500):
+    n, size = frames.n_frames, len(places)
+    seen = np.zeros((n, size), dtype=bool)
+    used = landmark >= 0
+    seen[frames.frame[used], landmark[used]] = True
+    neighbours = cKDTree(places).query(places, k=min(n_neighbours + 1, size))[1].reshape(size, -1)
+    total = np.zeros(size)
+    for chunk in np.array_split(np.arange(n), 1 + n // 500):
         R, t = T[chunk, :3, :3], T[chunk, :3, 3]
         p = np.einsum("nba,nlb->nla", R, places[None] - t[:, None])
         z = np.maximum(p[..., 2], 1e-9)
         rays = np.stack([p[..., 0] / z, p[..., 1] / z, p[..., 2]], axis=-1)
-        total += ((rays >= low) & (rays <= high)).all(axis=-1).sum(axis=0)
+        in_view = ((rays >= low) & (rays <= high)).all(axis=-1)
+        total += (in_view & seen[chunk][:, neighbours].any(axis=-1)).sum(axis=0)
     return total
 
 
 def compact(keep: Array, landmark: IntArray) -> IntArray:
     """Labels of the kept landmarks, numbered anew; the others become -1."""
-    number = np.where(keep, np.cumsum(keep) - 1, -1)
-    return np.where(landmark >= 0, number[landmark], -1)
+    number = np.append(np.where(keep, np.cumsum(keep) - 1, -1), -1)  # the last one is for -1 itself
+    return number[landmark]
 
 
 def find_overlooked(
@@ -85,6 +92,7 @@ def find_overlooked(
     displacement: Array,
     cluster: IntArray,
     radius: float,
+    duplicate_radius: float,
     minimum: int,
     config: TrackletConfig,
 ) -> Array:
@@ -92,7 +100,7 @@ def find_overlooked(
 
     Each left-over point is moved back by the displacement (n, c, 3) of the cluster next to it, in its own frame: a
     flower that was only seen while its cluster swayed stands still after that. Where that cluster was not seen (NaN)
-    nothing is known of the point.
+    nothing is known of the point. What lies within ``duplicate_radius`` of a landmark is that flower's own outliers.
     """
     left = np.flatnonzero(landmark < 0)
     if len(left) < minimum:
@@ -115,4 +123,7 @@ def find_overlooked(
     pieces = build_tracklets(rest, T, cov_pose, replace(config, min_age=10**9))
     shortest = max(2, minimum // 2)
     label, found = merge_pieces(world, var[left], pieces.labels, rest.frame, rest.n_frames, radius, shortest)
-    return found[np.bincount(label[label >= 0], minlength=len(found)) >= minimum]
+    found = found[np.bincount(label[label >= 0], minlength=len(found)) >= minimum]
+    if len(places) and len(found):
+        found = found[cKDTree(places).query(found)[0] > duplicate_radius]
+    return found

@@ -313,11 +313,13 @@ def combine_directions(forward: Followed, backward: Followed, frames: Frames, cl
     ``backward`` must have been brought back to the order of ``frames``.
     """
     n_clusters = forward.score.shape[1]
+    if n_clusters == 0:
+        return np.full(len(frames), -1, dtype=np.int64)
     use_backward = backward.score > forward.score + 1e-9
     out = np.full(len(frames), -1, dtype=np.int64)
     strength = np.full(len(frames), -np.inf)
     for followed, use in ((forward, ~use_backward), (backward, use_backward)):
-        owner = np.where(followed.landmark >= 0, cluster[followed.landmark], n_clusters)
+        owner = np.append(cluster, n_clusters)[followed.landmark]
         chosen = (owner < n_clusters) & use[frames.frame, np.minimum(owner, n_clusters - 1)]
         gain = followed.score[frames.frame, np.minimum(owner, n_clusters - 1)]
         better = chosen & (gain > strength)

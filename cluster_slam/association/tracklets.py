@@ -33,7 +33,8 @@ def relative_pose_cov(
     """Covariances (n, 6, 6) of each camera pose relative to those of the last ``window_s``.
 
     ``cov_white`` (6, 6) is what each pose errs for itself, in the camera frame. A wrong hand-eye transform, error xi, turns into
-    (I - Ad(D^-1)) xi when the camera has moved by D since the start of the window; ``cov_step`` (n, 6, 6) of odometry adds up.
+    (I - Ad(D^-1)) xi when the camera has moved by D since the start of the window; ``cov_step``
+    (n - 1, 6, 6) of odometry adds up.
     """
     n = len(T)
     out = np.tile(cov_white, (n, 1, 1))
@@ -44,7 +45,7 @@ def relative_pose_cov(
         out = out + A @ cov_hand_eye @ np.swapaxes(A, -1, -2)
     if cov_step is not None:
         total = np.concatenate([np.zeros((1, 6, 6)), np.cumsum(cov_step, axis=0)])
-        out = out + total[np.arange(n) + 1] - total[start + 1]
+        out = out + total - total[start]
     return out
 
 

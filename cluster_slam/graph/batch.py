@@ -89,16 +89,17 @@ class BatchSmoother:
     """Gauss-Newton on the whole session with the association given."""
 
     def __init__(
-        self, frames: Frames, poses: PoseModel, landmark: IntArray, pairs: Pairs, noise_scale: float = 1.0
+        self, frames: Frames, poses: PoseModel, landmark: IntArray, pairs: Pairs, correlation: float = 1.0
     ) -> None:
-        """``landmark`` (m,) flower of each sorted observation or -1; stated covariances times ``noise_scale``."""
+        """``landmark`` (m,) flower of each sorted observation or -1; so many in a row count as one (``correlation``)."""
+        self.correlation = correlation
         self.frames, self.poses, self.pairs = frames, poses, pairs
         self.rows = np.flatnonzero(landmark >= 0)
         self.landmark = landmark[self.rows]
         self.frame = frames.frame[self.rows]
         self.pair = pairs.of[self.rows]
         self.c = frames.points[self.rows]
-        chol = np.linalg.cholesky(frames.covs[self.rows] * noise_scale)
+        chol = np.linalg.cholesky(frames.covs[self.rows])
         self.whiten = np.linalg.inv(chol)  # triangular factors of well-scaled covariances
         self.n_places = int(landmark.max(initial=-1)) + 1
         self.keys = _Keys(len(pairs.frame), frames.n_frames, len(pairs.stretch_sigma), self.n_places)
@@ -107,7 +108,7 @@ class BatchSmoother:
     def residuals(self, e: Estimate) -> tuple[Array, Array]:
         """Whitened residuals (q, 3) and predicted camera points (q, 3) of the assigned observations."""
         R, t = e.T[self.frame, :3, :3], e.T[self.frame, :3, 3]
-        p = e.places[self.landmark] + np.where(self.pair[:, None] >= 0, e.d[self.pair], 0.0)
+        p = e.places[self.landmark] + e.d[self.pair]
         h = (np.swapaxes(R, 1, 2) @ (p - t)[..., None])[..., 0]
         return (self.whiten @ (self.c - h)[..., None])[..., 0], h
 
@@ -122,22 +123,35 @@ class BatchSmoother:
             graph.add(gtsam.JacobianFactor(self.keys.l + j, weak, np.zeros(3), _UNIT[3]))
         return graph
 
-    def _add_observations(self, graph: gtsam.GaussianFactorGraph, e: Estimate) -> None:
+    def whitened(self, e: Estimate) -> tuple[Array, Array, Array]:
+        """Whitened Jacobians by the pose (q, 3, 6) and by the place or displacement (q, 3, 3), and residuals (q, 3)."""
         r, h = self.residuals(e)
-        root = np.sqrt(e.weight[self.rows])
-        use = np.flatnonzero(root > 1e-4)
-        W = self.whiten[use] * root[use, None, None]
-        A_z = W @ np.concatenate([skew(h[use]), np.broadcast_to(-np.eye(3), (len(use), 3, 3))], axis=-1)
-        A_l = W @ np.swapaxes(e.T[self.frame[use], :3, :3], 1, 2)
-        b = r[use] * root[use, None]
-        z, l, d = self.keys.z + self.frame[use], self.keys.l + self.landmark[use], self.keys.d + self.pair[use]
-        has_pair = self.pair[use] >= 0
+        A_z = self.whiten @ np.concatenate([skew(h), np.broadcast_to(-np.eye(3), (len(h), 3, 3))], axis=-1)
+        return A_z, self.whiten @ np.swapaxes(e.T[self.frame, :3, :3], 1, 2), r
+
+    def _add_observations(self, graph: gtsam.GaussianFactorGraph, e: Estimate) -> None:
+        A_z, A_l, b = self.whitened(e)
+        root = np.sqrt(e.weight[self.rows] / self.correlation)
+        use = np.flatnonzero(e.weight[self.rows] > 1e-8)
+        A_z, A_l, b = (x[use] * root[use].reshape(-1, *([1] * (x.ndim - 1))) for x in (A_z, A_l, b))
+        z = (self.keys.z + self.frame[use]).tolist()
+        place = (self.keys.l + self.landmark[use]).tolist()
+        d = (self.keys.d + self.pair[use]).tolist()
         factor, unit = gtsam.JacobianFactor, _UNIT[3]
-        for k, (kz, kl, kd, pair) in enumerate(zip(z.tolist(), l.tolist(), d.tolist(), has_pair.tolist(), strict=True)):
-            if pair:
-                graph.add(factor(kz, A_z[k], kl, A_l[k], kd, A_l[k], b[k], unit))
-            else:
-                graph.add(factor(kz, A_z[k], kl, A_l[k], b[k], unit))
+        for k in range(len(use)):
+            graph.add(factor(z[k], A_z[k], place[k], A_l[k], d[k], A_l[k], b[k], unit))
+
+    def pose_information(self, e: Estimate) -> Array:
+        """Information (n, 6, 6) that the given poses alone have about each camera pose, its neighbours held."""
+        if self.poses.cov_step is None:
+            return np.broadcast_to(np.linalg.inv(self._cov_camera(e)), (len(e.T), 6, 6))
+        step = np.linalg.inv(self.poses.cov_step)
+        out = np.zeros((len(e.T), 6, 6))
+        out[1:] += step
+        back = adjoint(inverse(inverse(e.T[:-1]) @ e.T[1:]))
+        out[:-1] += np.swapaxes(back, 1, 2) @ step @ back
+        out[0] += 1e12 * np.eye(6)
+        return out
 
     def _add_poses(self, graph: gtsam.GaussianFactorGraph, e: Estimate) -> None:
         model, keys = self.poses, self.keys
@@ -201,11 +215,11 @@ class BatchSmoother:
         """One Gauss-Newton step and the size of the largest change of a place, m."""
         delta = self.graph(e).optimize(self._ordering())
         keys = self.keys
-        n, l, p, s = len(e.T), self.n_places, len(e.d), len(self.pairs.stretch_sigma)
+        n, p, s = len(e.T), len(e.d), len(self.pairs.stretch_sigma)
         z = np.array([delta.at(keys.z + i) for i in range(n)])
-        places = np.array([delta.at(keys.l + j) for j in range(l)]).reshape(l, 3)
-        d = np.array([delta.at(keys.d + i) for i in range(p)]).reshape(p, 3)
-        b = np.array([delta.at(keys.b + i) for i in range(s)]).reshape(s, 3)
+        places = np.array([delta.at(keys.l + j) for j in range(self.n_places)]).reshape(-1, 3)
+        d = np.array([delta.at(keys.d + i) for i in range(p)]).reshape(-1, 3)
+        b = np.array([delta.at(keys.b + i) for i in range(s)]).reshape(-1, 3)
         self._stretch_mean = b if self._stretch_mean is None else self._stretch_mean + b
         X = None if e.X is None else e.X @ se3_exp(delta.at(keys.x))
         moved = replace(e, T=e.T @ se3_exp(z), X=X, places=e.places + places, d=e.d + d)

@@ -1,0 +1,116 @@
+"""How large the errors of a session really are, from the residuals of its own smoothing.
+
+A residual is smaller than the error that made it, because the unknowns follow the errors; what each group of
+measurements keeps is its redundancy (Foerstner 1979; Helmert's variance components). The ratio of a group's squared
+residuals to its redundancy is the factor by which its stated variance is wrong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cluster_slam.geometry import Array, inverse, se3_log
+from cluster_slam.graph.batch import BatchSmoother, Estimate
+
+_LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987)
+_MEDIAN_CHI2_3 = 2.366
+_PLAUSIBLE = 16.0 / _MEDIAN_CHI2_3  # what an association gate lets through, far more than sigmas wrong by two
+
+
+@dataclass(frozen=True, slots=True)
+class VarianceFactors:
+    """Factors on stated variances: of flowers, of poses, and how many observations in a row say the same thing."""
+
+    flower: float
+    pose: float
+    correlation: float
+
+
+def variance_factors(smoother: BatchSmoother, estimate: Estimate) -> VarianceFactors:
+    """Factors by which the stated variances should be multiplied, at a solved estimate."""
+    used = estimate.weight[smoother.rows] > 0.5
+    A_z, A_d, residual = smoother.whitened(estimate)
+    prior = smoother.pose_information(estimate)
+    n = len(estimate.T)
+    order = np.argsort(smoother.frame[used], kind="stable")
+    rows = np.flatnonzero(used)[order]
+    bounds = np.searchsorted(smoother.frame[rows], np.arange(n + 1))
+    redundancy_flower, redundancy_pose = -3.0 * smoother.n_places, 0.0
+    for i in range(n):
+        here = rows[bounds[i] : bounds[i + 1]]
+        if len(here) == 0:
+            continue
+        free, posterior = _frame_redundancy(smoother, A_z[here], A_d[here], smoother.pair[here], prior[i])
+        redundancy_flower += free
+        redundancy_pose += 6.0 - float(np.trace(posterior[:6, :6] @ prior[i]))
+    flower = _ratio(float((residual[used] ** 2).sum()), redundancy_flower)
+    pose = 1.0
+    if smoother.poses.cov_step is None:
+        predicted = smoother.poses.given if estimate.X is None else smoother.poses.given @ estimate.X
+        error = se3_log(inverse(predicted) @ estimate.T)
+        seen = np.diff(bounds) > 0
+        pose = _ratio(float(np.einsum("ni,nij,nj->", error[seen], prior[seen], error[seen])), redundancy_pose)
+    return VarianceFactors(flower, pose, _correlation_factor(smoother, residual, used, n))
+
+
+def correlation_at_given_poses(smoother: BatchSmoother, given: Estimate) -> float:
+    """How many observations in a row say the same thing, if the given poses can be believed; else one.
+
+    Where drifting poses as they are given leave residuals no larger than the observations' stated noise allows, it is
+    the observations that err slowly (a detector's bias changes with the view), not the poses: they must not bend the
+    trajectory. Where the residuals are larger than that, the poses have drifted.
+    """
+    residual, _ = smoother.residuals(given)
+    chi2 = (residual**2).sum(axis=1)
+    if len(chi2) == 0 or float(np.median(chi2)) > _PLAUSIBLE * _MEDIAN_CHI2_3:
+        return 1.0
+    used = chi2 < 4.0 * _PLAUSIBLE * _MEDIAN_CHI2_3  # the rest are outliers
+    return _correlation_factor(smoother, residual, used, len(given.T))
+
+
+def _frame_redundancy(
+    smoother: BatchSmoother, A_z: Array, A_d: Array, pair: Array, prior: Array
+) -> tuple[float, Array]:
+    """Redundancy of one frame's observations, and the covariance of its pose and displacements."""
+    q = len(A_z)
+    pairs, column = np.unique(pair, return_inverse=True)
+    J = np.zeros((q, 3, 6 + 3 * len(pairs)))
+    J[:, :, :6] = A_z
+    J[np.arange(q)[:, None, None], np.arange(3)[:, None], (6 + 3 * column)[:, None, None] + np.arange(3)] = A_d
+    data = np.einsum("qia,qib->ab", J, J)
+    N = data.copy()
+    N[:6, :6] += prior
+    N[range(6, len(N)), range(6, len(N))] += np.repeat(smoother.pairs.sigma[pairs] ** -2, 3)
+    posterior = np.linalg.inv(N)
+    return 3.0 * q - float((posterior * data).sum()), posterior
+
+
+def _ratio(square: float, redundancy: float) -> float:
+    return float(np.clip(square / redundancy, 1e-3, 1e4)) if redundancy > 30.0 else 1.0
+
+
+def _correlation_factor(smoother: BatchSmoother, residual: Array, used: Array, n: int) -> float:
+    """1 + 2 sum of the residuals' autocorrelation over time, up to the first lag at which it is lost."""
+    series = np.zeros((n, smoother.n_places, 3))
+    seen = np.zeros((n, smoother.n_places))
+    at = (smoother.frame[used], smoother.landmark[used])
+    series[at] = residual[used]
+    seen[at] = 1.0
+    power = float((series**2).sum() / max(3.0 * seen.sum(), 1.0))
+    total, last_lag, last_value = 1.0, 0, 1.0
+    for lag in _LAGS:
+        if lag >= n:
+            break
+        count = float((seen[lag:] * seen[:-lag]).sum())
+        if count < 30 or power == 0.0:
+            break
+        value = float((series[lag:] * series[:-lag]).sum()) / (3.0 * count * power)
+        if value < 2.0 / np.sqrt(3.0 * count):
+            break
+        # Lags between are interpolated; lag zero itself counts once and is in the leading one.
+        between = lag - last_lag
+        total += 2.0 * (value + (between - 1) * 0.5 * (value + min(last_value, 2.0 * value)))
+        last_lag, last_value = lag, value
+    return total
