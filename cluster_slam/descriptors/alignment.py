@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from cluster_slam.geometry import Array, skew, so3_exp
-from tracking.gaussian import LOG_2PI, cholesky, forward_substitution, symmetrise
+from tracking.gaussian import LOG_2PI, cholesky, symmetrise
 
 NEWTON_STEPS = 12
 GAUSS_NEWTON_STEPS = 10
-CONVERGED = 1e-9  # rad and m
+CONVERGED = 1e-7  # rad and m; the distance is off by the square of it in sigmas
 FREE_TURN = 1.0 / (2.0 * np.pi)  # information of a rotation about which nothing is known: its integral is 2 pi
 
 
@@ -111,8 +111,8 @@ def _linearised(R: Array, t: Array, offsets: Array, cov_a: Array, b: Array, cov_
     lower = cholesky(symmetrise(_turned_cov(R, cov_a) + cov_b), "covariance of the residuals")
     J = np.concatenate([-R[..., None, :, :] @ skew(offsets), np.broadcast_to(np.eye(3), (*b.shape, 3))], axis=-1)
     J = J.reshape(*b.shape[:-2], 3 * k, 6)
-    columns = forward_substitution(lower[..., None, :, :], np.swapaxes(J, -1, -2))
-    return lower, np.swapaxes(columns, -1, -2), forward_substitution(lower, e)
+    white = np.asarray(np.linalg.solve(lower, np.concatenate([J, e[..., None]], axis=-1)), np.float64)
+    return lower, white[..., :6], white[..., 6]
 
 
 def _turned_cov(R: Array, cov: Array) -> Array:
