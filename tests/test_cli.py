@@ -32,7 +32,7 @@ from cluster_slam.simulate import PRESETS, SimulateConfig, simulate_session
 
 MADE = make(3, n_frames=60)
 HEAVY = ["numpy", "scipy", "gtsam", "cv2", "plotly", "matplotlib", "filterpy", "onnxruntime", "rich"]
-COMMANDS = ["smooth", "simulate", "evaluate", "check", "figures", "reproduce paper"]
+COMMANDS = ["smooth", "simulate", "evaluate", "check", "figures", "compare-descriptors", "reproduce paper"]
 Smooth = Callable[..., Result]
 
 

@@ -84,6 +84,39 @@ def test_a_kalman_update_is_the_linear_one() -> None:
     np.testing.assert_allclose(gain, P @ H.T @ np.linalg.inv(H @ P @ H.T + R), atol=1e-9)
 
 
+@pytest.mark.parametrize("alpha", [1e-3, 0.1, 1.0])
+def test_a_filter_made_of_transforms_is_the_kalman_filter_on_a_linear_model(alpha: float) -> None:
+    """Fifty steps of a constant-velocity target: the Kalman filter, filterpy's UKF and ours agree."""
+    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+
+    rng = np.random.default_rng(5)
+    F, H = np.eye(6) + 0.1 * np.eye(6, k=3), np.eye(3, 6)
+    Q, R, rule = 0.01 * np.eye(6), 0.2 * np.eye(3), SigmaRule(alpha)
+    theirs = UnscentedKalmanFilter(
+        6, 3, 0.1, lambda x: H @ x, lambda x, dt: F @ x, MerweScaledSigmaPoints(6, alpha, 2.0, 0.0)
+    )
+    theirs.Q, theirs.R = Q, R
+    x, P = np.zeros(6), np.eye(6)
+    ours_x, ours_P = x, P
+    for _ in range(50):
+        z = rng.standard_normal(3)
+        x, P = F @ x, F @ P @ F.T + Q
+        gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+        x, P = x + gain @ (z - H @ x), P - gain @ H @ P
+        ours_x, ours_P = unscented_transform(ours_x, ours_P, lambda s: s @ F.T, rule)
+        ours_P = ours_P + Q
+        both, joint = unscented_transform(ours_x, ours_P, lambda s: np.concatenate([s, s @ H.T], axis=-1), rule)
+        S = joint[6:, 6:] + R
+        ours_x = ours_x + joint[:6, 6:] @ np.linalg.solve(S, z - both[6:])
+        ours_P = ours_P - joint[:6, 6:] @ np.linalg.solve(S, joint[6:, :6])
+        theirs.predict()
+        theirs.update(z)
+    np.testing.assert_allclose(ours_x, x, atol=1e-9)
+    np.testing.assert_allclose(ours_P, P, atol=1e-9)
+    np.testing.assert_allclose(ours_x, theirs.x, atol=1e-8)
+    np.testing.assert_allclose(ours_P, theirs.P, atol=1e-8)
+
+
 def test_stacks_and_a_beta_of_each() -> None:
     rng = np.random.default_rng(2)
     mean, cov, beta = rng.standard_normal((2, 5, 3)), spd(rng, 2, 5, 3), rng.uniform(0, 2, (2, 5))

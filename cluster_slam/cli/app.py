@@ -12,7 +12,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from cluster_slam import __version__
-from cluster_slam.cli import check, evaluate, figures, reproduce, simulate, smooth
+from cluster_slam.cli import check, compare, evaluate, figures, reproduce, simulate, smooth
 from cluster_slam.errors import ClusterSlamError
 
 EXIT_POOR = 1  # it ran, but the result is poor
@@ -48,11 +48,12 @@ def _options(
     """Options of all commands; ``main`` has taken ``--debug`` out before."""
 
 
-app.command("smooth")(smooth.command)
+app.command("smooth", short_help="Turn a session into a map of flower clusters.")(smooth.command)
 app.command("simulate")(simulate.command)
 app.command("evaluate")(evaluate.command)
 app.command("check")(check.command)
 app.command("figures")(figures.command)
+app.command("compare-descriptors")(compare.command)
 app.add_typer(reproduce.app, name="reproduce")
 
 
