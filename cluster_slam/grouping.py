@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.cluster.vq import kmeans2
 from scipy.sparse import csr_matrix
@@ -54,8 +56,7 @@ def group_flowers(
     if config.method == "kmeans":
         if config.n_clusters is None:
             raise ConfigError("grouping.method kmeans wants grouping.n_clusters")
-        _, label = kmeans2(places, min(config.n_clusters, n), minit="++", rng=rng)
-        return _numbered(label)
+        return _numbered(kmeans2(places, min(config.n_clusters, n), minit="++", rng=rng)[1])
     if n == 1:
         return np.zeros(1, dtype=np.int64)
     distance = np.linalg.norm(places[:, None] - places[None], axis=-1)
@@ -68,7 +69,7 @@ def group_flowers(
     return label if _come_in_clusters(places, presence, label) else np.arange(n)
 
 
-def _numbered(label: Array) -> IntArray:
+def _numbered(label: NDArray[Any]) -> IntArray:
     """Labels 0..c-1 in the order of first appearance."""
     _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=np.int64)
@@ -78,7 +79,7 @@ def _numbered(label: Array) -> IntArray:
 
 def _spacing(places: Array) -> float:
     """Median distance of a flower to its nearest, m."""
-    return float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
+    return float(np.median(np.asarray(cKDTree(places).query(places, k=2)[0])[:, 1]))
 
 
 def _likeliest_cut(tree: Array, places: Array, view_volume: float) -> IntArray:
@@ -90,9 +91,10 @@ def _likeliest_cut(tree: Array, places: Array, view_volume: float) -> IntArray:
     sides = np.ptp(places, axis=0)
     volume = max(float(np.prod(np.maximum(sides, 0.1 * sides.max()))), view_volume)
     prior_sigma = 0.7 * _spacing(places)
-    best, best_score = np.arange(len(places)), -np.inf
+    best: IntArray = np.arange(len(places), dtype=np.int64)
+    best_score = -np.inf
     for height in np.concatenate([[0.0], np.unique(tree[:, 2]) * (1.0 + 1e-12)]):
-        label = fcluster(tree, height, "distance") - 1
+        label = fcluster(tree, height, "distance").astype(np.int64) - 1
         score = _log_likelihood(label, places, volume, prior_sigma)
         if score > best_score:
             best, best_score = label, score
@@ -119,7 +121,7 @@ def _come_in_clusters(places: Array, presence: csr_matrix, label: IntArray) -> b
     """Whether this session's flowers come in clusters at all: some have three members, which are seen together."""
     if np.bincount(label).max() < _FEWEST:
         return False
-    nearest = cKDTree(places).query(places, k=2)[1][:, 1]
+    nearest = np.asarray(cKDTree(places).query(places, k=2)[1])[:, 1]
     both = np.asarray(presence.multiply(presence[nearest]).sum(axis=1)).ravel()
     count = np.asarray(presence.sum(axis=1)).ravel()
     together = both / np.maximum(count + count[nearest] - both, 1)

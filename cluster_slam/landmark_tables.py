@@ -10,7 +10,7 @@ from cluster_slam.association.displacement import cluster_pairs
 from cluster_slam.association.frames import Frames
 from cluster_slam.descriptors import inertia_and_mean_distance, unscented_moments
 from cluster_slam.geometry import Array
-from cluster_slam.records import Clusters, Drift, Flowers, IntArray, State
+from cluster_slam.records import BoolArray, Clusters, Drift, Flowers, IntArray, State
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +25,8 @@ class RestMap:
     def block(self, members: IntArray) -> Array:
         """Joint covariance (3 k, 3 k) of k members."""
         index = (3 * members[:, None] + np.arange(3)).ravel()
-        return self.joint_cov[np.ix_(index, index)]
+        block: Array = self.joint_cov[np.ix_(index, index)]
+        return block
 
 
 def flower_table(rest: RestMap, frames: Frames) -> Flowers:
@@ -44,7 +45,7 @@ def flower_table(rest: RestMap, frames: Frames) -> Flowers:
     )
 
 
-def cluster_table(rest: RestMap, frames: Frames, confirmed: Array) -> Clusters:
+def cluster_table(rest: RestMap, frames: Frames, confirmed: BoolArray) -> Clusters:
     """The clusters: unweighted centroids, descriptors from the joint covariance of the members.
 
     ``confirmed`` (c,) says which clusters stand; the others are tentative.

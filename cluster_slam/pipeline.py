@@ -24,13 +24,14 @@ from cluster_slam.geometry import Array, transform
 from cluster_slam.graph.batch import BatchSmoother, Estimate, Marginals, Pairs, PoseModel
 from cluster_slam.graph.hand_eye import hand_eye_from_pieces
 from cluster_slam.graph.noise import camera_covs, pose_model
-from cluster_slam.graph.variance import VarianceFactors, correlation_at_given_poses, variance_factors
+from cluster_slam.graph.variance import VarianceFactors, errs_slowly, variance_factors
 from cluster_slam.grouping import Motion, group_flowers
 from cluster_slam.landmark_tables import RestMap, cluster_table, drift_table, flower_table
-from cluster_slam.records import Calibration, Diagnostics, IntArray, RejectReason, Result, Session
+from cluster_slam.records import BoolArray, Calibration, Diagnostics, IntArray, RejectReason, Result, Session
 from tracking.gating import chi2_threshold
 
 Progress = Callable[[str, float], None]
+_NO_WEIGHT = 1e6  # observations that must not bend the trajectory count as one in so many
 _REST_SIGMA_M = 0.0004  # ambient sway of a cluster at rest
 
 
@@ -45,7 +46,7 @@ class _World:
     cluster: IntArray  # (l,)
     radius: float  # pieces of one flower lie within, m
     noise: VarianceFactors  # what was found about the stated variances so far
-    least_correlation: float = 1.0  # so many observations in a row say the same thing, at least
+    errs_slowly: bool = False  # errors of observations cannot be told from drift of the poses
 
 
 def smooth(
@@ -87,7 +88,7 @@ def smooth(
             or (i > 0 and int((world.landmark != before).sum()) < 5e-4 * len(before))
         )
         if i == 0 and model.cov_step is not None:
-            world = replace(world, least_correlation=_correlation_at_given_poses(frames, model, world))
+            world = replace(world, errs_slowly=_errs_slowly(frames, model, world))
         smoother, estimate = _smooth(frames, model, world, config, 3)
         world = _learn(world, smoother, estimate)
         world = _regroup(frames, world, config, rng)
@@ -104,6 +105,8 @@ def smooth(
         known, world = world.noise, _learn(world, smoother, estimate)
         if abs(np.log(world.noise.flower / known.flower)) + abs(np.log(world.noise.pose / known.pose)) < 0.1:
             break
+    if world.errs_slowly:  # all observations of a flower say the same: its place is as uncertain as one of them
+        smoother.correlation = float(np.bincount(smoother.landmark, minlength=1).max())
     marginals = smoother.marginals(estimate)
     clock.lap("smoothing")
     return _result(session, frames, world, smoother, estimate, marginals, config, seed, merged, clock.laps)
@@ -117,22 +120,20 @@ def _with_variances(frames: Frames, model: PoseModel, noise: VarianceFactors) ->
 def _learn(world: _World, smoother: BatchSmoother, estimate: Estimate) -> _World:
     """Take over what the smoothing found: poses, hand-eye transform, places, and how large the errors really are."""
     found = variance_factors(smoother, estimate)
-    noise = VarianceFactors(
-        world.noise.flower * found.flower,
-        world.noise.pose * found.pose,
-        max(found.correlation, world.least_correlation),
-    )
+    if world.errs_slowly:
+        found = VarianceFactors(1.0, 1.0, _NO_WEIGHT)  # slow errors hide from residuals: the stated ones stay
+    noise = VarianceFactors(world.noise.flower * found.flower, world.noise.pose * found.pose, found.correlation)
     return replace(world, T=estimate.T, X=estimate.X, places=estimate.places, noise=noise)
 
 
-def _correlation_at_given_poses(frames: Frames, model: PoseModel, world: _World) -> float:
-    """How slowly the observations err if the odometry is believed as it is given."""
+def _errs_slowly(frames: Frames, model: PoseModel, world: _World) -> bool:
+    """Whether the observations of this session err slowly, if the odometry is believed as it is given."""
     given = model.given if world.X is None else model.given @ world.X
     w = transform(given[frames.frame], frames.points)
     var = np.trace(frames.covs, axis1=1, axis2=2) / 3.0
     places = group_means(w, var, world.landmark, len(world.places)).mean
     smoother, start = _problem(frames, model, replace(world, T=given, places=places))
-    return correlation_at_given_poses(smoother, replace(start, d=np.zeros_like(start.d)))
+    return errs_slowly(smoother, replace(start, d=np.zeros_like(start.d)))
 
 
 class _Clock:
@@ -214,9 +215,9 @@ def _minimum(frames: Frames, config: SmoothConfig) -> int:
     return int(min(config.min_observations, max(1, frames.n_frames // 4)))
 
 
-def _in_long_pieces(labels: IntArray, shortest: int) -> Array:
+def _in_long_pieces(labels: IntArray, shortest: int) -> BoolArray:
     count = np.bincount(labels[labels >= 0])
-    long: Array = count[labels] >= shortest
+    long: BoolArray = count[labels] >= shortest
     return long
 
 
@@ -233,7 +234,7 @@ def _spacing(frames: Frames, w: Array, var: Array, labels: IntArray, shortest: i
     return spacing if np.isfinite(spacing) else 6.0 * float(np.sqrt(np.median(var)))
 
 
-def _keep(keep: Array, landmark: IntArray, places: Array) -> tuple[IntArray, Array]:
+def _keep(keep: BoolArray, landmark: IntArray, places: Array) -> tuple[IntArray, Array]:
     return compact(keep, landmark), places[keep]
 
 
@@ -285,7 +286,7 @@ def _problem(frames: Frames, model: PoseModel, world: _World) -> tuple[BatchSmoo
         weight=(world.landmark >= 0).astype(float),
         residual_chi2=np.full(len(frames), np.nan),
     )
-    correlation = max(world.noise.correlation, world.least_correlation)
+    correlation = _NO_WEIGHT if world.errs_slowly else world.noise.correlation
     return BatchSmoother(frames, model, world.landmark, pairs, correlation), start
 
 
@@ -373,7 +374,7 @@ def _result(
     n_clusters = int(world.cluster.max(initial=-1)) + 1
     warnings = _shortcomings(session, frames, world)
     confirmed = np.zeros(n_clusters, dtype=bool)
-    np.logical_or.at(confirmed, world.cluster, flowers.n_observations >= _minimum(frames, config))
+    np.logical_or.at(confirmed, world.cluster, _is_confirmed(world, outlier, _minimum(frames, config)))
     clusters = cluster_table(rest, frames, confirmed)
     pairs = smoother.pairs
     _, cov = measured_displacements(frames, estimate.T, world.landmark, estimate.places, pairs.of, len(pairs.frame))
@@ -415,6 +416,15 @@ def _result(
         merged=tuple(merged),
         status="poor" if warnings else "ok",
     )
+
+
+def _is_confirmed(world: _World, outlier: BoolArray, minimum: int) -> BoolArray:
+    """Which flowers (l,) stand: enough observations that agree, and more of those than of others."""
+    n = len(world.places)
+    total = np.bincount(world.landmark[world.landmark >= 0], minlength=n)
+    disagree = np.bincount(world.landmark[outlier], minlength=n)
+    stands: BoolArray = (total - disagree >= minimum) & (disagree <= 0.5 * total)
+    return stands
 
 
 def _shortcomings(session: Session, frames: Frames, world: _World) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cluster_slam.geometry import Array
 
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 PoseFrame = Literal["T_world_camera", "T_world_flange"]
 PoseError = Literal["absolute", "odometry"]
 State = Literal["tentative", "confirmed", "lost"]

@@ -13,7 +13,7 @@ from cluster_slam.association.landmarks import merge_pieces
 from cluster_slam.association.tracklets import build_tracklets
 from cluster_slam.config import TrackletConfig
 from cluster_slam.geometry import Array, inverse, transform
-from cluster_slam.records import IntArray
+from cluster_slam.records import BoolArray, IntArray
 
 
 def merge_ghosts(
@@ -40,7 +40,7 @@ def merge_ghosts(
 
 def supported(
     frames: Frames, T: Array, places: Array, landmark: IntArray, minimum: int, least_share: float = 0.12
-) -> Array:
+) -> BoolArray:
     """Which landmarks (l,) are believed: often enough seen at all, and in enough of the frames that looked at them.
 
     A frame looked at a place if it was in the field of view and one of the landmarks next to it was seen (so nothing
@@ -50,10 +50,10 @@ def supported(
     count = np.bincount(landmark[landmark >= 0], minlength=len(places)).astype(float)
     if not count.any():
         return np.zeros(len(places), dtype=bool)
-    share = count / np.maximum(frames_that_looked(frames, T, places, landmark), count)
+    share = count / np.maximum(np.maximum(frames_that_looked(frames, T, places, landmark), count), 1.0)
     order = np.argsort(share)
     usual = share[order][np.searchsorted(np.cumsum(count[order]), 0.5 * count.sum())]
-    believed: Array = (count >= minimum) & (share >= least_share * usual)
+    believed: BoolArray = (count >= minimum) & (share >= least_share * usual)
     return believed
 
 
@@ -76,7 +76,7 @@ def frames_that_looked(frames: Frames, T: Array, places: Array, landmark: IntArr
     return total
 
 
-def compact(keep: Array, landmark: IntArray) -> IntArray:
+def compact(keep: BoolArray, landmark: IntArray) -> IntArray:
     """Labels of the kept landmarks, numbered anew; the others become -1."""
     number = np.append(np.where(keep, np.cumsum(keep) - 1, -1), -1)  # the last one is for -1 itself
     return number[landmark]

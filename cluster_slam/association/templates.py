@@ -1,9 +1,10 @@
 """Clusters followed as templates through sway: each is a rigid set of flowers with one displacement of its own.
 
-The state of cluster j is its displacement from rest and its velocity, (d, v), a noisy spring. In every frame all flowers
-in view and all points are assigned one to one, the frame's pose error is found and taken away, and each cluster's state
-is updated with all its matched flowers at once. A cluster that loses its flowers (a shake begins with a jump in velocity
-that no filter predicts) is searched for: every pair of one of its flowers and one free point is a hypothesis.
+The state of cluster j is its displacement from rest and its velocity, (d, v), a noisy spring. In every frame all
+flowers in view and all points are assigned one to one, the frame's pose error is found and taken away, and each
+cluster's state is updated with all its matched flowers at once. A cluster that loses its flowers (a shake begins with a
+jump in velocity that no filter predicts) is searched for: each pair of one of its flowers and one free point is a
+hypothesis.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from cluster_slam.association.frames import Frames, field_of_view, information, 
 from cluster_slam.association.tracklets import match, solve_pose_correction
 from cluster_slam.config import TemplateConfig
 from cluster_slam.geometry import Array, inverse, rotate_cov, se3_exp, transform
-from cluster_slam.records import IntArray
+from cluster_slam.records import BoolArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +40,7 @@ class _Springs:
         self.unseen = np.zeros(n, dtype=np.int64)
         self.reset(np.ones(n, dtype=bool))
 
-    def reset(self, which: Array) -> None:
+    def reset(self, which: BoolArray) -> None:
         c = self.config
         self.x[which] = 0.0
         sigma = np.repeat([0.001, 0.001 * 2 * np.pi * c.sway_hz], 3)
@@ -128,12 +129,12 @@ class Follower:
         self.landmark[here.start + cols] = flowers[rows]
         self.chi2[here.start + cols] = chi2
 
-    def _in_view(self, i: int) -> Array:
+    def _in_view(self, i: int) -> BoolArray:
         p = transform(inverse(self.T[i]), self.places + self.springs.x[self.cluster, :3])
         z = np.where(p[:, 2] > 1e-6, p[:, 2], 1e-6)
         rays = np.column_stack([p[:, 0] / z, p[:, 1] / z, p[:, 2]])
         slack = np.array([0.02, 0.02, 0.1 * self.high[2]])
-        visible: Array = ((rays > self.low - slack) & (rays < self.high + slack)).all(axis=1)
+        visible: BoolArray = ((rays > self.low - slack) & (rays < self.high + slack)).all(axis=1)
         return visible
 
     def _absorb(self, i: int, flowers: IntArray, cols: IntArray, w: Array, S: Array) -> None:
@@ -265,7 +266,8 @@ class _JumpPrior:
     def __call__(self, d: Array) -> Array:
         step = d - self.predicted
         chi2 = ((step @ self.information) * step).sum(1)
-        return np.maximum(-0.5 * chi2, -6.0 - 0.5 * (step * step).sum(1) / self.jump_sigma**2)
+        value: Array = np.maximum(-0.5 * chi2, -6.0 - 0.5 * (step * step).sum(1) / self.jump_sigma**2)
+        return value
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -288,7 +290,8 @@ def _gains(d: Array, L: Array, points: Array, W: Array, match_gain: float) -> Ar
     x, y, z = np.moveaxis(points[None, None] - (L[None, :] + d[:, None])[:, :, None], -1, 0)
     chi2 = x * (W[:, 0, 0] * x + 2.0 * (W[:, 0, 1] * y + W[:, 0, 2] * z))
     chi2 += y * (W[:, 1, 1] * y + 2.0 * W[:, 1, 2] * z) + W[:, 2, 2] * z * z
-    return np.maximum(match_gain - 0.5 * chi2, 0.0)
+    gain: Array = np.maximum(match_gain - 0.5 * chi2, 0.0)
+    return gain
 
 
 def _greedy(gain: Array) -> tuple[IntArray, IntArray]:

@@ -15,12 +15,12 @@ from scipy.optimize import linear_sum_assignment
 from cluster_slam.association.frames import Frames, chi2_and_log_det, information, point_jacobian
 from cluster_slam.config import TrackletConfig
 from cluster_slam.geometry import Array, adjoint, inverse, rotate_cov, se3_exp, transform
-from cluster_slam.records import IntArray
+from cluster_slam.records import BoolArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracklets:
-    """Pieces: ``labels`` (m,) piece of each sorted observation, ``n`` pieces, ``innovation_chi2`` (m,) NaN where first."""
+    """``labels`` (m,) piece of each sorted observation, ``n`` pieces, ``innovation_chi2`` (m,), NaN where first."""
 
     labels: IntArray
     n: int
@@ -32,8 +32,8 @@ def relative_pose_cov(
 ) -> Array:
     """Covariances (n, 6, 6) of each camera pose relative to those of the last ``window_s``.
 
-    ``cov_white`` (6, 6) is what each pose errs for itself, in the camera frame. A wrong hand-eye transform, error xi, turns into
-    (I - Ad(D^-1)) xi when the camera has moved by D since the start of the window; ``cov_step``
+    ``cov_white`` (6, 6) is what each pose errs for itself, in the camera frame. A wrong hand-eye transform, error xi,
+    turns into (I - Ad(D^-1)) xi when the camera has moved by D since the start of the window; ``cov_step``
     (n - 1, 6, 6) of odometry adds up.
     """
     n = len(T)
@@ -42,10 +42,10 @@ def relative_pose_cov(
     start = np.minimum(start, np.maximum(np.arange(n) - 1, 0))
     if cov_hand_eye is not None:
         A = np.eye(6) - adjoint(inverse(inverse(T[start]) @ T))
-        out = out + A @ cov_hand_eye @ np.swapaxes(A, -1, -2)
+        out += A @ cov_hand_eye @ np.swapaxes(A, -1, -2)
     if cov_step is not None:
         total = np.concatenate([np.zeros((1, 6, 6)), np.cumsum(cov_step, axis=0)])
-        out = out + total - total[start]
+        out += total - total[start]
     return out
 
 
@@ -59,13 +59,13 @@ def solve_pose_correction(
     J = point_jacobian(R, c)
     W = information(cov)
     JW = np.swapaxes(J, -1, -2) @ W
-    z = np.zeros(6)
+    z: Array = np.zeros(6)
     for _ in range(n_iterations):
         r = residual - J @ z
         weight = 1.0 / (1.0 + np.einsum("qi,qij,qj->q", r, W, r) / 3.0)
         H = np.tensordot(weight, JW @ J, axes=1) + information_prior
         g = np.tensordot(weight, (JW @ residual[..., None])[..., 0], axes=1)
-        z = np.linalg.solve(H, g)
+        z = np.linalg.solve(H, g).astype(np.float64)
     return z
 
 
@@ -79,7 +79,7 @@ class _Pieces:
         self.age = np.empty(0, dtype=np.int64)
         self.last_frame = np.empty(0, dtype=np.int64)
 
-    def keep(self, alive: Array) -> None:
+    def keep(self, alive: BoolArray) -> None:
         self.position, self.cov, self.label = self.position[alive], self.cov[alive], self.label[alive]
         self.age, self.last_frame = self.age[alive], self.last_frame[alive]
 

@@ -1,8 +1,8 @@
 """All of a session in one factor graph: camera poses, hand-eye transform, flowers at rest, displacements of clusters.
 
-Unknowns, with their keys: z_i tangent of camera pose i, x tangent of the hand-eye transform, l_j place of flower j at rest,
-d_p displacement that all flowers of one cluster share in one frame (a "pair" p), b_s mean displacement of a cluster over a
-stretch of frames in which it moves. An observation k of flower j in frame i is
+Unknowns, with their keys: z_i tangent of camera pose i, x tangent of the hand-eye transform, l_j place of flower j at
+rest, d_p displacement that all flowers of one cluster share in one frame (a "pair" p), b_s mean displacement of a
+cluster over a stretch of frames in which it moves. An observation k of flower j in frame i is
 
     c_k = T_world_camera[i]^-1 (l_j + d_p) + noise
 
@@ -59,7 +59,7 @@ class PoseModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """The unknowns: camera poses (n, 4, 4), hand-eye (4, 4) or None, places (l, 3), displacements (p, 3), weights (m,)."""
+    """The unknowns: poses (n, 4, 4), hand-eye (4, 4) or None, places (l, 3), displacements (p, 3); weights (m,)."""
 
     T: Array
     X: Array | None
@@ -91,7 +91,7 @@ class BatchSmoother:
     def __init__(
         self, frames: Frames, poses: PoseModel, landmark: IntArray, pairs: Pairs, correlation: float = 1.0
     ) -> None:
-        """``landmark`` (m,) flower of each sorted observation or -1; so many in a row count as one (``correlation``)."""
+        """``landmark`` (m,) flower of each sorted observation or -1; ``correlation`` observations count as one."""
         self.correlation = correlation
         self.frames, self.poses, self.pairs = frames, poses, pairs
         self.rows = np.flatnonzero(landmark >= 0)
@@ -268,7 +268,7 @@ class BatchSmoother:
 
 
 def _truncated_weights(chi2: Array, threshold: float, mu: float) -> Array:
-    """Weights of graduated truncated least squares (Yang et al. 2020, eq. 14); unassigned observations weigh nothing."""
+    """Weights of graduated truncated least squares (Yang et al. 2020, eq. 14); the unassigned weigh nothing."""
     r2 = np.nan_to_num(chi2, nan=np.inf)
     low, high = mu / (mu + 1.0) * threshold, (mu + 1.0) / mu * threshold
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from cluster_slam.association.frames import point_jacobian
-from cluster_slam.geometry import Array, se3_exp, se3_log, so3_exp, transform
+from cluster_slam.geometry import Array, inverse, se3_exp, se3_log, so3_exp, transform
 from cluster_slam.records import IntArray
 
 _MULTI_START_RAD = 0.5  # a prior wider than this says nothing: all orientations are tried
@@ -65,7 +65,7 @@ class _PieceProblem:
             r2 = (self.residuals(X, weight) ** 2).sum(-1) / self.var
             scale = max(float(np.median(r2)) / 2.366, 1.0)  # far from the answer all residuals are large
             weight = 1.0 / (self.var * scale * (1.0 + r2 / (3.0 * scale)))
-            xi, H = self.step(X, weight, prior_information, se3_log(np.linalg.solve(X0, X)))
+            xi, H = self.step(X, weight, prior_information, se3_log(inverse(X0) @ X))
             X = X @ se3_exp(xi)
             if np.linalg.norm(xi) < 1e-7:
                 break
@@ -91,7 +91,7 @@ def hand_eye_from_pieces(
     X0 : (4, 4) the measured transform.
     prior_cov : (6, 6) how well it is known.
     """
-    prior_information = np.linalg.inv(prior_cov)
+    prior_information: Array = np.linalg.inv(prior_cov).astype(np.float64)
     problem = _PieceProblem(T_world_flange, points, var, labels)
     start = X0
     if np.sqrt(prior_cov[0, 0]) > _MULTI_START_RAD:

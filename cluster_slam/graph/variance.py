@@ -13,10 +13,12 @@ import numpy as np
 
 from cluster_slam.geometry import Array, inverse, se3_log
 from cluster_slam.graph.batch import BatchSmoother, Estimate
+from cluster_slam.records import BoolArray, IntArray
 
 _LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987)
-_MEDIAN_CHI2_3 = 2.366
-_PLAUSIBLE = 16.0 / _MEDIAN_CHI2_3  # what an association gate lets through, far more than sigmas wrong by two
+_CHI2_3_AT_10 = 0.584  # 10 % quantile of chi-square with three degrees of freedom
+_GATE_CHI2 = 16.0
+_LEAST_WHITE = 0.17  # share of the stated variance that changes from frame to frame; sigmas wrong by two leave 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,23 +57,25 @@ def variance_factors(smoother: BatchSmoother, estimate: Estimate) -> VarianceFac
     return VarianceFactors(flower, pose, _correlation_factor(smoother, residual, used, n))
 
 
-def correlation_at_given_poses(smoother: BatchSmoother, given: Estimate) -> float:
-    """How many observations in a row say the same thing, if the given poses can be believed; else one.
+def errs_slowly(smoother: BatchSmoother, given: Estimate) -> bool:
+    """Whether it is the observations that err slowly (a detector's bias changes with the view), not the given poses.
 
-    Where drifting poses as they are given leave residuals no larger than the observations' stated noise allows, it is
-    the observations that err slowly (a detector's bias changes with the view), not the poses: they must not bend the
-    trajectory. Where the residuals are larger than that, the poses have drifted.
+    Two things together say so: at the poses as they are given many residuals are no larger than an association gate
+    lets through, and from frame to frame they change far less than the stated noise would make them. Low quantiles
+    are compared, since such detectors also jump.
     """
     residual, _ = smoother.residuals(given)
     chi2 = (residual**2).sum(axis=1)
-    if len(chi2) == 0 or float(np.median(chi2)) > _PLAUSIBLE * _MEDIAN_CHI2_3:
-        return 1.0
-    used = chi2 < 4.0 * _PLAUSIBLE * _MEDIAN_CHI2_3  # the rest are outliers
-    return _correlation_factor(smoother, residual, used, len(given.T))
+    if len(chi2) < 30 or float(np.quantile(chi2, 0.25)) > _GATE_CHI2:
+        return False
+    order = np.lexsort((smoother.frame, smoother.landmark))
+    same = np.diff(smoother.landmark[order]) == 0
+    change = (np.diff(residual[order], axis=0)[same] ** 2).sum(axis=1)
+    return len(change) >= 30 and float(np.quantile(change, 0.1)) < _LEAST_WHITE * 2.0 * _CHI2_3_AT_10
 
 
 def _frame_redundancy(
-    smoother: BatchSmoother, A_z: Array, A_d: Array, pair: Array, prior: Array
+    smoother: BatchSmoother, A_z: Array, A_d: Array, pair: IntArray, prior: Array
 ) -> tuple[float, Array]:
     """Redundancy of one frame's observations, and the covariance of its pose and displacements."""
     q = len(A_z)
@@ -91,7 +95,7 @@ def _ratio(square: float, redundancy: float) -> float:
     return float(np.clip(square / redundancy, 1e-3, 1e4)) if redundancy > 30.0 else 1.0
 
 
-def _correlation_factor(smoother: BatchSmoother, residual: Array, used: Array, n: int) -> float:
+def _correlation_factor(smoother: BatchSmoother, residual: Array, used: BoolArray, n: int) -> float:
     """1 + 2 sum of the residuals' autocorrelation over time, up to the first lag at which it is lost."""
     series = np.zeros((n, smoother.n_places, 3))
     seen = np.zeros((n, smoother.n_places))
