@@ -12,7 +12,7 @@ from cluster_slam.io.folder import check_writable, recover, write_folder
 from cluster_slam.reproduce import page
 from cluster_slam.reproduce.figures import figure_files
 from cluster_slam.reproduce.paper_page import Reproduction, percent_text, render
-from cluster_slam.reproduce.settings import Settings
+from cluster_slam.reproduce.settings import PAPER_TABLE_2, Settings
 from cluster_slam.reproduce.table1 import table1
 from cluster_slam.reproduce.table2 import table2
 from cluster_slam.reproduce.table3 import own_frame_matches, recordings, table3
@@ -88,12 +88,29 @@ def check_replaceable(out: Path, marker: str) -> None:
 
 def _tables(done: Reproduction) -> dict[str, str]:
     one = [(f"{row.noise:g}", f"{row.frobenius_norm:.4e}", f"{row.outlier_percent:.2f}") for row in done.table1]
-    two = [(row.reading, row.padding, row.correct_match, f"{row.false_positive_avg:.4f}") for row in done.table2]
+    two = [
+        (
+            row.reading,
+            row.padding,
+            row.correct_match,
+            f"{row.false_positive_avg:.4f}",
+            *PAPER_TABLE_2[row.padding != "none"],
+        )
+        for row in done.table2
+    ]
+    two_header = (
+        "reading",
+        "padding",
+        "correct_match",
+        "false_positive_avg",
+        "paper_correct",
+        "paper_false_positive_avg",
+    )
     three = [(r.comparison, r.match, r.n_frames, r.paper_match, percent_text(r)) for r in done.table3]
     three_header = ("comparison", "match", "n_frames", "paper_match", "other_clusters_percent")
     return {
         "table1.csv": page.csv_text(("noise", "frobenius_norm", "outlier_percent"), one),
-        "table2.csv": page.csv_text(("reading", "padding", "correct_match", "false_positive_avg"), two),
+        "table2.csv": page.csv_text(two_header, two),
         "table3.csv": page.csv_text(three_header, three),
     }
 
