@@ -24,7 +24,7 @@ from cluster_slam.geometry import Array, transform
 from cluster_slam.graph.batch import BatchSmoother, Estimate, Marginals, Pairs, PoseModel
 from cluster_slam.graph.hand_eye import hand_eye_from_pieces
 from cluster_slam.graph.noise import camera_covs, pose_model
-from cluster_slam.graph.variance import VarianceFactors, errs_slowly, variance_factors
+from cluster_slam.graph.variance import VarianceFactors, displacement_correlation, errs_slowly, variance_factors
 from cluster_slam.grouping import Motion, group_flowers
 from cluster_slam.landmark_tables import RestMap, cluster_table, drift_table, flower_table
 from cluster_slam.records import BoolArray, Calibration, Diagnostics, IntArray, RejectReason, Result, Session
@@ -32,6 +32,7 @@ from tracking.gating import chi2_threshold
 
 Progress = Callable[[str, float], None]
 _NO_WEIGHT = 1e6  # observations that must not bend the trajectory count as one in so many
+_CALM_HAND_EYE_RAD = 0.005  # a hand-eye transform known so well does not spoil pieces
 _REST_SIGMA_M = 0.0004  # ambient sway of a cluster at rest
 
 
@@ -89,7 +90,7 @@ def smooth(
         )
         if i == 0 and model.cov_step is not None:
             world = replace(world, errs_slowly=_errs_slowly(frames, model, world))
-        smoother, estimate = _smooth(frames, model, world, config, 3)
+        smoother, estimate = _smooth(frames, model, world, config, 2)
         world = _learn(world, smoother, estimate)
         world = _regroup(frames, world, config, rng)
         clock.lap("smoothing")
@@ -99,14 +100,17 @@ def smooth(
         merged += new
     world = _drop_unsupported(stated, world, config)
     say("smoothing all", 0.85)
-    for _ in range(2):
+    for n_iterations in (4, 2):
         frames, model = _with_variances(stated, stated_poses, world.noise)
-        smoother, estimate = _smooth(frames, model, world, config, 6)
+        smoother, estimate = _smooth(frames, model, world, config, n_iterations)
         known, world = world.noise, _learn(world, smoother, estimate)
         if abs(np.log(world.noise.flower / known.flower)) + abs(np.log(world.noise.pose / known.pose)) < 0.1:
             break
     if world.errs_slowly:  # all observations of a flower say the same: its place is as uncertain as one of them
         smoother.correlation = float(np.bincount(smoother.landmark, minlength=1).max())
+    smoother.pairs = replace(
+        smoother.pairs, sigma=smoother.pairs.sigma * np.sqrt(displacement_correlation(smoother, estimate))
+    )
     marginals = smoother.marginals(estimate)
     clock.lap("smoothing")
     return _result(session, frames, world, smoother, estimate, marginals, config, seed, merged, clock.laps)
@@ -163,6 +167,7 @@ def _first_world(stated: Frames, stated_poses: PoseModel, config: SmoothConfig, 
         long = _in_long_pieces(pieces.labels, shortest)
         factor = _innovation_factor(pieces.innovation_chi2[long])
         noise = VarianceFactors(noise.flower * factor, noise.pose * factor, 1.0)
+        cov_before = cov_X
         if model.X0 is not None and long.any():
             X, data = hand_eye_from_pieces(
                 model.given[frames.frame[long]],
@@ -173,7 +178,7 @@ def _first_world(stated: Frames, stated_poses: PoseModel, config: SmoothConfig, 
                 model.cov_hand_eye,
             )
             cov_X = np.linalg.inv(data + np.linalg.inv(model.cov_hand_eye))
-        elif factor == 1.0:
+        if factor == 1.0 and (X is None or cov_X[0, 0] + cov_before[0, 0] < _CALM_HAND_EYE_RAD**2):
             break
     T = model.given if X is None else model.given @ X
     w, var, labels = transform(T[frames.frame], frames.points), _scalar_var(frames, model), pieces.labels
