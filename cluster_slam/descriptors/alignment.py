@@ -24,6 +24,10 @@ class Aligned:
     dof: Array  # (...) 3 k - 6, more where the shape leaves a rotation undetermined
     log_likelihood: Array  # (...) of b given a, integrated over a pose of which nothing is known (per m^3)
 
+    def of(self, index: int) -> Aligned:
+        """One of a stack."""
+        return Aligned(self.T[index], self.distance_sq[index], self.dof[index], self.log_likelihood[index])
+
 
 def largest_overlap(H: Array) -> Array:
     """max over rotations R of tr(R' H) (...), for sums H = sum a b' given as nine components (9, ...).

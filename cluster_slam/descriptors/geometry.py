@@ -21,6 +21,7 @@ from tracking.gaussian import ensure_positive_definite
 
 FIRST_LIMIT = 0.999  # the search begins within this gate and widens while it finds nothing
 WIDER = 4.0
+ALIGNED_AT_ONCE = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +37,7 @@ class GeometryMatch:
     runner_up_sq: float  # no other map found within the limit costs less; inf where there is no other
 
 
+NOT_ALIGNED = Aligned(np.eye(4), np.array(np.inf), np.array(0.0), np.array(-np.inf))
 NO_MATCH = GeometryMatch(np.inf, 0, -np.inf, np.zeros(0, np.int64), np.zeros(0, np.int64), np.eye(4), np.inf)
 
 
@@ -75,52 +77,74 @@ def match_geometry(
         raise InputError(f"missed_cost must be > 0, got {missed_cost}")
     if len(a) > len(b) and not np.isfinite(missed_cost):
         return _turned(match_geometry(b, cov_b, a, cov_a, missed_cost=missed_cost, limit=limit))
+    pair = _Pair(a, cov_a, b, cov_b, missed_cost if np.isfinite(missed_cost) else 0.0)
     var, alone = _largest_var(cov_a) + _largest_var(cov_b), (len(a) + len(b)) * missed_cost
     current = min(alone, first_limit(len(a), len(b), missed_cost) if limit is None else limit)
     while True:
         maps = search_maps(a[None], b[None], np.array([var]), np.array([current]), missed_cost)
-        best = _best(maps, a, cov_a, b, cov_b, missed_cost, current)
+        best = _best(maps, pair, current)
         if limit is not None or np.isfinite(best.distance_sq) or current >= alone or not np.isfinite(current):
             return best
         current = min(alone, current * WIDER)
 
 
-def _best(
-    maps: Maps, a: Array, cov_a: Array, b: Array, cov_b: Array, missed_cost: float, limit: float
-) -> GeometryMatch:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """Two clusters and what a member without partner costs."""
+
+    a: Array
+    cov_a: Array
+    b: Array
+    cov_b: Array
+    price: float  # 0 where the smaller cluster is matched whole
+
+    def align(self, partner: IntArray) -> tuple[Array, list[Aligned]]:
+        """Costs (s,) and alignments of maps (s, n)."""
+        counts = (partner != MISSED).sum(1)
+        costs, found = np.full(len(partner), np.inf), [NOT_ALIGNED] * len(partner)
+        for k in np.unique(counts[counts >= 2]).tolist():
+            rows = np.flatnonzero(counts == k)
+            i = np.nonzero(partner[rows] != MISSED)[1].reshape(len(rows), k)
+            j = np.take_along_axis(partner[rows], i, axis=1)
+            aligned = self._align(i, j)
+            costs[rows] = aligned.distance_sq + self.price * (len(self.a) + len(self.b) - 2 * k)
+            for at, row in enumerate(rows.tolist()):
+                found[row] = aligned.of(at)
+        return costs, found
+
+    def _align(self, i: IntArray, j: IntArray) -> Aligned:
+        var = _common_var(self.cov_a, self.cov_b)
+        if var is not None:
+            return align_isotropic(self.a[i], self.b[j], np.full(len(i), var))
+        return align(self.a[i], _of_members(self.cov_a, i), self.b[j], _of_members(self.cov_b, j))
+
+
+def _best(maps: Maps, pair: _Pair, limit: float) -> GeometryMatch:
     """Align the maps by increasing bound until no bound is left below the best cost."""
-    var = _common_var(cov_a, cov_b)
-    price = missed_cost if np.isfinite(missed_cost) else 0.0
-    best, best_cost, next_cost = None, np.inf, np.inf
-    for row, bound in zip(maps.partner, maps.bound, strict=True):
-        if bound > best_cost:
-            next_cost = min(next_cost, float(bound))
-            break
-        i = np.flatnonzero(row != MISSED)
-        if len(i) < 2:
-            continue
-        aligned = _aligned(a, cov_a, b, cov_b, i, row[i], var)
-        cost = float(aligned.distance_sq) + price * (len(a) + len(b) - 2 * len(i))
-        if cost < best_cost:
-            best, best_cost, next_cost = (aligned, i, row[i]), cost, best_cost
-        else:
-            next_cost = min(next_cost, cost)
-    if best is None or best_cost > limit:
+    best, best_at, best_cost, next_cost = NOT_ALIGNED, -1, np.inf, np.inf
+    start, step = 0, 1
+    while start < len(maps.bound) and maps.bound[start] <= best_cost:
+        costs, found = pair.align(maps.partner[start : start + step])
+        for at, cost in enumerate(costs.tolist()):
+            if cost < best_cost:
+                best, best_at, best_cost, next_cost = found[at], start + at, cost, best_cost
+            else:
+                next_cost = min(next_cost, cost)
+        start, step = start + step, ALIGNED_AT_ONCE
+    if start < len(maps.bound):
+        next_cost = min(next_cost, float(maps.bound[start]))
+    if best_cost > limit or best_at < 0:
         return NO_MATCH
-    aligned, i, j = best
-    log_likelihood, dof = float(aligned.log_likelihood), int(aligned.dof)
-    return GeometryMatch(float(aligned.distance_sq), dof, log_likelihood, i, j, aligned.T, next_cost)
-
-
-def _aligned(a: Array, cov_a: Array, b: Array, cov_b: Array, i: IntArray, j: IntArray, var: float | None) -> Aligned:
-    if var is not None:
-        return align_isotropic(a[i], b[j], np.asarray(var))
-    return align(a[i], _of_members(cov_a, i), b[j], _of_members(cov_b, j))
+    row = maps.partner[best_at]
+    i = np.flatnonzero(row != MISSED)
+    values = float(best.distance_sq), int(best.dof), float(best.log_likelihood)
+    return GeometryMatch(*values, i, row[i], best.T, next_cost)
 
 
 def _of_members(cov: Array, members: IntArray) -> Array:
-    index = (3 * members[:, None] + np.arange(3)).ravel()
-    out: Array = cov[np.ix_(index, index)]
+    """Joint covariances (s, 3 k, 3 k) of some choices (s, k) of members."""
+    index = (3 * members[..., None] + np.arange(3)).reshape(len(members), -1)
+    out: Array = cov[index[:, :, None], index[:, None, :]]
     return out
 
 
