@@ -54,12 +54,21 @@ class TemplateConfig:
 class ParticleConfig:
     """Options of the association where poses drift."""
 
-    n_particles: int = 200
-    odometry_factors: tuple[float, ...] = (1.0, 3.0, 10.0)  # of the stated sigmas: wheels slip, clocks are late
-    odometry_shares: tuple[float, ...] = (0.6, 0.3, 0.1)  # of the particles that draw each factor
-    gate_chi2: float = 25.0  # 3 degrees of freedom
-    new_chi2: float = 14.0  # a new landmark is as likely as a match that fits so badly
-    least_share: float = 0.5  # of effective particles; below that they are drawn anew
+    n_particles: int = 100  # for a stretch; twice as many after a gap
+    n_tries: int = 3  # of a stretch after a gap; the best is kept
+    stretch_points: int = 80  # points that are associated before all is smoothed again
+    ahead_points: int = 40  # that are looked at beyond, before a stretch is believed
+    odometry_scale: float = 1.5  # stated sigmas of odometry are taken times this ...
+    odometry_dof: float = 2.0  # ... and errors of a usual step from Student's t: wheels slip, clocks are late
+    point_dof: float = 3.0  # Student's t of points
+    wide: float = 4.0  # a point may also fit so many times worse than stated ...
+    wide_share: float = 0.1  # ... as this share of them does
+    new_share: float = 1e-4  # of points that found a landmark, before the data
+    clutter_share: float = 1e-5  # of points that are false
+    clutter_cost: float = 20.0  # chi-square at which a point is no landmark's
+    growing_cost: float = 40.0  # chi-square that a new landmark must save while the map grows ...
+    landmark_cost: float = 80.0  # ... and in the end: errors repeat, so a place that few points like better is none
+    merge_reach_m: float = 0.8  # landmarks so close are tried as one
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,9 @@ import numpy as np
 
 from cluster_slam.geometry import Array, adjoint, inverse, se3_log
 from cluster_slam.graph.batch import PoseModel
-from cluster_slam.records import Session
+from cluster_slam.records import Session, StatedNoise
 
+_GAP = 1.5  # usual intervals; odometry over a longer one has not seen the way
 _LEAST_SIGMA = 1e-7  # m or rad: a pose that is stated exact still has an invertible covariance
 
 
@@ -19,10 +20,7 @@ def pose_model(session: Session) -> PoseModel:
         moved = se3_log(inverse(session.poses[:-1]) @ session.poses[1:])
         turned = np.linalg.norm(moved[:, :3], axis=1)
         travelled = np.linalg.norm(moved[:, 3:], axis=1)
-        step = _diagonal(
-            np.hypot(noise.pose_rotation, noise.odometry_rotation * turned),
-            np.hypot(noise.pose_translation, noise.odometry_translation * travelled),
-        )
+        step = _step_covs(turned, travelled, np.diff(session.stamps), noise)
         axis = planar_axis(moved)
         if axis is not None:
             step = _in_plane(step, axis)
@@ -33,6 +31,24 @@ def pose_model(session: Session) -> PoseModel:
         X0=session.T_flange_camera,
         cov_hand_eye=_diagonal(np.array(noise.hand_eye_rotation), np.array(noise.hand_eye_translation)),
     )
+
+
+def _step_covs(turned: Array, travelled: Array, dt: Array, noise: StatedNoise) -> Array:
+    """Covariances (s, 6, 6) of steps that turned (s,) rad and travelled (s,) m in dt (s,) s.
+
+    Over a gap only the net motion is known, and the way may have been longer: it is taken to have turned and travelled
+    at the session's usual rate, and the part that is always there to have been there once for each usual step. A
+    turning error moves the end of the way too: by its root mean square over the way, s / sqrt(3).
+    """
+    usual = float(np.median(dt)) if len(dt) else 1.0
+    short = dt <= _GAP * usual
+    gap = np.where(short, 0.0, dt)
+    turned = np.hypot(turned, gap * turned[short].sum() / dt[short].sum())
+    travelled = np.hypot(travelled, gap * travelled[short].sum() / dt[short].sum())
+    times = np.sqrt(np.where(short, 1.0, dt / usual))
+    rotation = np.hypot(noise.pose_rotation * times, noise.odometry_rotation * turned)
+    translation = np.hypot(noise.pose_translation * times, noise.odometry_translation * travelled)
+    return _diagonal(rotation, np.hypot(translation, rotation * travelled / np.sqrt(3.0)))
 
 
 def planar_axis(moved: Array, tolerance: float = 1e-5) -> Array | None:

@@ -1,0 +1,292 @@
+"""Association where poses drift: the map grows stretch by stretch, all is smoothed after each, decisions are undone.
+
+Dead reckoning cannot be trusted for longer than a few seconds, so points are compared with landmarks from an
+*estimated* pose. Stretches are gone through with particles; then all poses and places so far are smoothed, all points
+are associated again, and landmarks are merged where that makes the whole likelier, each landmark having a price. In
+the end every stretch is associated once more, with the map that the others make. All this is done forwards and
+backwards in time, since one beginning may be easier than the other, and the likelier outcome is kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from cluster_slam.association.drift_smoother import DriftSmoother, Steps, steps_of
+from cluster_slam.association.frames import Frames
+from cluster_slam.association.particles import trace_stretch
+from cluster_slam.config import ParticleConfig
+from cluster_slam.geometry import Array, adjoint, inverse, transform
+from cluster_slam.records import IntArray
+
+_GAP = 5.0  # usual steps; what is longer is a gap, in which nothing was seen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Traced:
+    """Camera poses (n, 4, 4), landmark of each point (m,) or -1, places (l, 3), covariances (n - 1, 6, 6) of the steps.
+
+    The covariances are the given ones as the session has shown them: larger where odometry slipped. ``cost`` is twice
+    the negative log-likelihood with the landmarks' price.
+    """
+
+    T: Array
+    label: IntArray
+    places: Array
+    cov_step: Array
+    cost: float
+
+
+def needs_tracing(frames: Frames, given: Array, cov_step: Array) -> bool:
+    """Whether poses (n, 4, 4) drift too far, and frames hold too few points, for an association by the given poses.
+
+    Where frames hold more points than their pose has unknowns, pieces correct the drift by themselves; and drift that
+    stays below the noise of the points does no harm.
+    """
+    if frames.n_frames < 3 or len(frames) < frames.n_frames:
+        return False
+    range_sq = float(np.median((frames.points**2).sum(axis=1)))
+    total = cov_step.sum(axis=0)
+    drift_sq = np.trace(total[3:, 3:]) + np.trace(total[:3, :3]) * range_sq
+    noise_sq = float(np.median(np.trace(frames.covs, axis1=1, axis2=2)))
+    return bool(drift_sq > 9.0 * noise_sq and len(frames) < 6 * frames.n_frames)
+
+
+def trace_drifting(
+    frames: Frames, given: Array, cov_step: Array, config: ParticleConfig, *, rng: np.random.Generator
+) -> Traced:
+    """Poses and association of a session whose poses drift.
+
+    Parameters
+    ----------
+    frames : Frames
+    given : (n, 4, 4) camera poses by odometry; the first defines the world.
+    cov_step : (n - 1, 6, 6) of each step, tangent at its end.
+    config : options.
+    rng : for the particles.
+    """
+    forward = _Tracer(frames, given, steps_of(given, cov_step, frames.stamps, config), config, rng)
+    A = adjoint(inverse(given[:-1]) @ given[1:])
+    turned = frames.reversed()
+    cov_back = (A @ cov_step @ np.swapaxes(A, 1, 2))[::-1]
+    backward = _Tracer(turned, given[::-1], steps_of(given[::-1], cov_back, turned.stamps, config), config, rng)
+    grown, grown_back = forward.price(forward.grow()), backward.price(backward.grow())
+    if grown.cost <= grown_back.cost:
+        best = forward.redo(grown)
+    else:
+        best = _played_back(backward.redo(grown_back), turned)
+    best = _anchored(best, given[0])
+    steps = steps_of(given, cov_step, frames.stamps, config)
+    weights = DriftSmoother(frames, steps, config.point_dof).step_weights(best.T)
+    scaled = cov_step * (config.odometry_scale**2 / weights)[:, None, None]
+    return Traced(best.T, best.label, best.places, scaled, best.cost)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    """Poses, labels and places of the frames so far, and what they cost."""
+
+    T: Array
+    label: IntArray
+    places: Array
+    cost: float
+
+
+def _played_back(state: _State, turned: Frames) -> _State:
+    """The outcome of the session played backwards, in the order of time."""
+    label = np.empty_like(state.label)
+    label[turned.order] = state.label
+    return _State(state.T[::-1], label, state.places, state.cost)
+
+
+def _anchored(state: _State, first: Array) -> _State:
+    """The same with the first pose (4, 4) where it defines the world."""
+    home = first @ inverse(state.T[0])
+    return _State(home @ state.T, state.label, transform(home, state.places), state.cost)
+
+
+class _Tracer:
+    """One pass through a session."""
+
+    def __init__(
+        self, frames: Frames, given: Array, steps: Steps, config: ParticleConfig, rng: np.random.Generator
+    ) -> None:
+        self.frames, self.given, self.steps, self.config, self.rng = frames, given, steps, config, rng
+
+    def grow(self) -> _State:
+        """Go through the session, stretch by stretch."""
+        n, starts, config = self.frames.n_frames, self.frames.starts, self.config
+        state = _State(np.empty((0, 4, 4)), np.empty(0, dtype=np.int64), np.empty((0, 3)), 0.0)
+        done = 0
+        while done < n:
+            end = min(max(done + 1, int(np.searchsorted(starts, starts[done] + config.stretch_points))), n)
+            ahead = min(int(np.searchsorted(starts, starts[end] + config.ahead_points)), n)
+            if n - end < 10:
+                end = ahead = n
+            after_gap = done == 0 or bool((self.steps.length[done - 1 : ahead - 1] > _GAP).any())
+            if after_gap:
+                end = ahead
+            tries = [
+                self._extend(state, done, end, ahead, after_gap) for _ in range(config.n_tries if after_gap else 1)
+            ]
+            state = min(tries, key=lambda s: s.cost)
+            done = end
+        return state
+
+    def _extend(self, state: _State, done: int, end: int, ahead: int, after_gap: bool) -> _State:
+        """Associate the frames from ``done`` to ``end`` and smooth all so far."""
+        found = trace_stretch(
+            self.frames,
+            self.steps,
+            (done, ahead),
+            state.T[-1] if done else self.given[0],
+            state.places,
+            self._covs(state),
+            self.config.n_particles * (2 if after_gap else 1),
+            self.config,
+            rng=self.rng,
+        )
+        n_points = int(self.frames.starts[end] - self.frames.starts[done])
+        T = np.concatenate([state.T, found.T[: end - done]])
+        label = np.concatenate([state.label, found.label[:n_points]])
+        price = self.config.growing_cost
+        return self._merge(self._settle(T, label, found.places, price), price)
+
+    def price(self, state: _State) -> _State:
+        """The same with the final price of landmarks, which merges more of them."""
+        price = self.config.landmark_cost
+        return self._merge(self._settle(state.T, state.label, state.places, price), price, 40)
+
+    def redo(self, state: _State) -> _State:
+        """Associate every stretch again, with the landmarks that the others support, as long as that helps."""
+        price = self.config.landmark_cost
+        for _ in range(2):
+            before = state.cost
+            for span in self._spans():
+                state = self._redo_span(state, span, price)
+            if before - state.cost < 1.0:
+                break
+        return state
+
+    def _spans(self) -> list[tuple[int, int]]:
+        """Frames from gap to gap (cut where they are many), and every two neighbours together."""
+        n = self.frames.n_frames
+        cuts = [0, *(np.flatnonzero(self.steps.length > _GAP) + 1).tolist(), n]
+        bounds = [0]
+        for a, b in pairwise(cuts):
+            bounds += np.linspace(a, b, max(1, round((b - a) / 120)) + 1).astype(int)[1:].tolist()
+        single = list(pairwise(bounds))
+        double = list(zip(bounds[:-2], bounds[2:], strict=True))
+        return sorted(single + double)
+
+    def _redo_span(self, state: _State, span: tuple[int, int], price: float) -> _State:
+        a, b = span
+        here = slice(int(self.frames.starts[a]), int(self.frames.starts[b]))
+        label = state.label.copy()
+        label[here] = -1
+        places, label = _compact(state.places, label)
+        others = _State(state.T, label, places, 0.0)
+        start = state.T[a - 1] if a else self.given[0]
+        found = trace_stretch(
+            self.frames,
+            self.steps,
+            span,
+            start,
+            places,
+            self._covs(others),
+            self.config.n_particles,
+            self.config,
+            rng=self.rng,
+        )
+        label[here] = found.label
+        T = state.T.copy()
+        T[a:b] = found.T
+        new = self._settle(T, label, found.places, price, 2)
+        return self._merge(new, price, 4) if new.cost < state.cost - 1e-6 else state
+
+    def _covs(self, state: _State) -> Array:
+        """How well places are known (l, 3, 3) relative to the latest pose: noise that repeats, and that does not."""
+        noise_sq = float(np.median(np.trace(self.frames.covs, axis1=1, axis2=2)))
+        count = np.bincount(state.label[state.label >= 0], minlength=len(state.places))
+        var = noise_sq * (0.06 + 2.5 / np.maximum(count, 1))
+        return np.asarray(var[:, None, None] * np.eye(3))
+
+    def _settle(self, T: Array, label: IntArray, places: Array, price: float, n_rounds: int = 3) -> _State:
+        """Smooth, associate again, until nothing changes."""
+        smoother = self._smoother(len(T))
+        places, label = _compact(places, label)
+        for _ in range(n_rounds):
+            T, places = smoother.solve(T, places, label)
+            again = self._associate(smoother, T, places)
+            same = float((again == label).mean())
+            places, label = _compact(places, again)
+            if same > 0.998:
+                break
+        T, places = smoother.solve(T, places, label)
+        clutter = self.config.clutter_cost * int((label < 0).sum())
+        return _State(T, label, places, smoother.cost(T, places, label) + clutter + price * len(places))
+
+    def _smoother(self, n: int) -> DriftSmoother:
+        f = self.frames
+        k = int(f.starts[n])
+        part = Frames(f.order[:k], f.starts[: n + 1], f.frame[:k], f.points[:k], f.covs[:k], f.stamps[:n])
+        return DriftSmoother(part, self.steps.until(n), self.config.point_dof)
+
+    def _associate(self, smoother: DriftSmoother, T: Array, places: Array) -> IntArray:
+        """Landmark of each point (m,), one to one in every frame; -1 where none fits."""
+        limit, frames = self.config.clutter_cost, smoother.frames
+        if len(places) == 0:
+            return np.full(len(frames), -1)
+        cost = smoother.point_cost(smoother.distances(T, places))
+        label = cost.argmin(axis=1)
+        label[cost.min(axis=1) > limit] = -1
+        for i in np.flatnonzero(np.diff(frames.starts) > 1):
+            here = frames.of(int(i))
+            q = here.stop - here.start
+            _, column = linear_sum_assignment(np.concatenate([cost[here], np.full((q, q), limit)], axis=1))
+            label[here] = np.where(column < len(places), column, -1)
+        return np.asarray(label)
+
+    def _merge(self, state: _State, price: float, n_tries: int = 12) -> _State:
+        """Try close landmarks that are hardly ever seen together as one; keep what makes the whole likelier."""
+        failed: set[tuple[float, ...]] = set()
+        while n_tries > 0:
+            merged = None
+            for a, b in self._merge_candidates(state):
+                key = tuple(np.round(np.concatenate([state.places[a], state.places[b]]), 1).tolist())
+                if key in failed or n_tries <= 0:
+                    continue
+                n_tries -= 1
+                label = np.where(state.label == a, b, state.label)
+                trial = self._settle(state.T, label, state.places, price, 2)
+                if trial.cost < state.cost:
+                    merged = trial
+                    break
+                failed.add(key)
+            if merged is None:
+                break
+            state = merged
+        return state
+
+    def _merge_candidates(self, state: _State) -> list[tuple[int, int]]:
+        """Pairs of landmarks (fewer points first), the closest first."""
+        n = len(state.places)
+        seen = np.zeros((n, len(state.T)))
+        used = state.label >= 0
+        seen[state.label[used], self.frames.frame[: len(state.label)][used]] = 1.0
+        both, count = seen @ seen.T, seen.sum(axis=1)
+        distance = np.linalg.norm(state.places[:, None] - state.places[None], axis=-1)
+        allowed = both <= np.maximum(1.0, 0.03 * np.minimum(count[:, None], count))
+        allowed &= (distance < self.config.merge_reach_m) & np.tri(n, k=-1, dtype=bool)
+        pairs = sorted((float(distance[a, b]), int(a), int(b)) for a, b in np.argwhere(allowed))
+        return [(a, b) if count[a] <= count[b] else (b, a) for _, a, b in pairs]
+
+
+def _compact(places: Array, label: IntArray) -> tuple[Array, IntArray]:
+    """Places (l, 3) and labels (m,) without the landmarks that fewer than two points support."""
+    keep = np.bincount(label[label >= 0], minlength=len(places)) >= 2
+    number = np.where(keep, np.cumsum(keep) - 1, -1)
+    return places[keep], np.where(label >= 0, number[label], -1) if len(places) else label
