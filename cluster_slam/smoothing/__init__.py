@@ -1,0 +1,1 @@
+"""The stages of smoothing a session whose associations nobody told."""

@@ -1,0 +1,154 @@
+"""One round: associate, smooth, group again, mend the set of landmarks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from cluster_slam.association.displacement import (
+    cluster_pairs,
+    measured_displacements,
+    motion_scale,
+    presence_of,
+)
+from cluster_slam.association.frames import Frames, view_volume
+from cluster_slam.association.landmarks import group_means
+from cluster_slam.association.refine import compact, find_overlooked, merge_ghosts, supported
+from cluster_slam.association.templates import Follower, combine_directions
+from cluster_slam.config import SmoothConfig
+from cluster_slam.geometry import transform
+from cluster_slam.graph.batch import BatchSmoother, Estimate, Pairs, PoseModel
+from cluster_slam.graph.noise import camera_covs
+from cluster_slam.graph.variance import errs_slowly
+from cluster_slam.grouping import Motion, group_flowers
+from cluster_slam.smoothing.world import NO_WEIGHT, World, fewest_observations, scalar_var
+from tracking.gating import chi2_threshold
+
+_REST_SIGMA_M = 0.0004  # ambient sway of a cluster at rest
+
+
+def associate(frames: Frames, model: PoseModel, world: World, config: SmoothConfig) -> World:
+    """Follow the clusters forwards and backwards; each frame of each cluster takes the better of the two."""
+    cov, _ = camera_covs(model, world.X)
+    cov_pose = np.tile(cov, (frames.n_frames, 1, 1))
+    forward = Follower(frames, world.T, cov_pose, world.places, world.cluster, config.follow).run()
+    back = frames.reversed()
+    backward = Follower(back, world.T[::-1], cov_pose, world.places, world.cluster, config.follow).run()
+    landmark = np.empty(len(frames), dtype=np.int64)
+    landmark[back.order] = backward.landmark
+    backward = replace(backward, landmark=landmark, score=backward.score[::-1])
+    landmark = combine_directions(forward, backward, frames, world.cluster)
+    keep = np.bincount(landmark[landmark >= 0], minlength=len(world.places)) > 0
+    _, cluster = np.unique(world.cluster[keep], return_inverse=True)
+    return replace(world, landmark=compact(keep, landmark), places=world.places[keep], cluster=cluster)
+
+
+def solve(
+    frames: Frames, model: PoseModel, world: World, config: SmoothConfig, n_iterations: int
+) -> tuple[BatchSmoother, Estimate]:
+    """Solve for poses, hand-eye transform, flowers and displacements, the association given."""
+    smoother, start = problem(frames, model, world)
+    return smoother, smoother.solve(start, chi2_threshold(3, config.outlier_probability), n_iterations)
+
+
+def problem(frames: Frames, model: PoseModel, world: World) -> tuple[BatchSmoother, Estimate]:
+    """The graph of the session and where its solution starts."""
+    of, frame, cluster = cluster_pairs(frames, world.landmark, world.cluster)
+    d, cov = measured_displacements(frames, world.T, world.landmark, world.places, of, len(frame))
+    pose_var = model.cov[3, 3] + model.cov[0, 0] * float(np.median((frames.points**2).sum(axis=1), keepdims=False))
+    scale = motion_scale(d, cov + pose_var * np.eye(3), frame, cluster, frames.stamps)
+    if np.bincount(world.cluster, minlength=1).max(initial=0) < 2:
+        scale = np.zeros_like(scale)  # flowers that stand alone tell no sway from errors of their own
+    pairs = Pairs(
+        of=of,
+        frame=frame,
+        cluster=cluster,
+        sigma=np.hypot(scale, _REST_SIGMA_M),
+        stretch=np.full(len(frame), -1),
+        stretch_sigma=np.empty(0),
+    )
+    start = Estimate(
+        T=world.T,
+        X=world.X,
+        places=world.places,
+        d=np.where(scale[:, None] > 0, d, 0.0),
+        weight=(world.landmark >= 0).astype(float),
+        residual_chi2=np.full(len(frames), np.nan),
+    )
+    correlation = NO_WEIGHT if world.errs_slowly else world.noise.correlation
+    return BatchSmoother(frames, model, world.landmark, pairs, correlation), start
+
+
+def observations_err_slowly(frames: Frames, model: PoseModel, world: World) -> bool:
+    """Whether the observations of this session err slowly, if the odometry is believed as it is given."""
+    given = model.given if world.X is None else model.given @ world.X
+    w = transform(given[frames.frame], frames.points)
+    var = np.trace(frames.covs, axis1=1, axis2=2) / 3.0
+    places = group_means(w, var, world.landmark, len(world.places)).mean
+    smoother, start = problem(frames, model, replace(world, T=given, places=places))
+    return errs_slowly(smoother, replace(start, d=np.zeros_like(start.d)))
+
+
+def regroup(frames: Frames, world: World, config: SmoothConfig, rng: np.random.Generator) -> World:
+    """Group the flowers again, now that it is known how each moved."""
+    n = len(world.places)
+    presence = presence_of(frames.frame, world.landmark, n, frames.n_frames)
+    used = world.landmark >= 0
+    u = np.full((frames.n_frames, n, 3), np.nan)
+    var = np.full((frames.n_frames, n), np.nan)
+    at = (frames.frame[used], world.landmark[used])
+    u[at] = transform(world.T[frames.frame[used]], frames.points[used]) - world.places[world.landmark[used]]
+    var[at] = np.trace(frames.covs[used], axis1=1, axis2=2) / 3.0
+    return replace(
+        world,
+        cluster=group_flowers(world.places, presence, Motion(u, var), view_volume(frames), config.grouping, rng=rng),
+    )
+
+
+def drop_unsupported(frames: Frames, world: World, config: SmoothConfig) -> World:
+    """Leave out what the last association does not support."""
+    keep = supported(frames, world.T, world.places, world.landmark, fewest_observations(frames, config))
+    _, cluster = np.unique(world.cluster[keep], return_inverse=True)
+    return replace(world, landmark=compact(keep, world.landmark), places=world.places[keep], cluster=cluster)
+
+
+def mend(
+    frames: Frames, model: PoseModel, world: World, estimate: Estimate, pairs: Pairs, config: SmoothConfig
+) -> tuple[World, list[tuple[int, int]]]:
+    """Merge ghosts, drop what too few observations support, and look for flowers that were overlooked."""
+    sigma = float(np.sqrt(np.median(scalar_var(frames, model))))
+    duplicate_radius = max(0.6 * world.radius, 4.0 * sigma)
+    landmark, merged = merge_ghosts(world.places, world.landmark, frames, duplicate_radius)
+    keep = supported(frames, world.T, world.places, landmark, fewest_observations(frames, config))
+    displacement = np.full((frames.n_frames, int(pairs.cluster.max(initial=0)) + 1, 3), np.nan)
+    displacement[pairs.frame, pairs.cluster] = estimate.d
+    owner = np.zeros(len(world.places), dtype=np.int64)
+    used = (world.landmark >= 0) & (pairs.of >= 0)
+    owner[world.landmark[used]] = pairs.cluster[pairs.of[used]]
+    cov, _ = camera_covs(model, world.X)
+    found = find_overlooked(
+        frames,
+        world.T,
+        np.tile(cov, (frames.n_frames, 1, 1)),
+        scalar_var(frames, model),
+        landmark,
+        world.places,
+        displacement,
+        owner,
+        world.radius,
+        duplicate_radius,
+        min(14, max(fewest_observations(frames, config), 1)),
+        config.tracklets,
+    )
+    landmark, places = compact(keep, landmark), world.places[keep]
+    places = np.concatenate([places, found])
+    # A new flower belongs to the cluster of the flower next to it until the next grouping.
+    cluster = world.cluster[keep]
+    if len(found) and len(cluster):
+        nearest = np.linalg.norm(found[:, None] - places[None, : len(cluster)], axis=-1).argmin(axis=1)
+        cluster = np.concatenate([cluster, cluster[nearest]])
+    elif len(found):
+        cluster = np.arange(len(found))
+    _, cluster = np.unique(cluster, return_inverse=True)
+    return replace(world, landmark=landmark, places=places, cluster=cluster), merged

@@ -1,0 +1,56 @@
+"""What is known while a session is being smoothed, and what is learned from each smoothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cluster_slam.association.frames import Frames
+from cluster_slam.config import SmoothConfig
+from cluster_slam.geometry import Array
+from cluster_slam.graph.batch import BatchSmoother, Estimate, PoseModel
+from cluster_slam.graph.variance import VarianceFactors, variance_factors
+from cluster_slam.records import IntArray
+
+NO_WEIGHT = 1e6  # observations that must not bend the trajectory count as one in so many
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class World:
+    """What is known while the session is being associated."""
+
+    T: Array  # (n, 4, 4) camera poses
+    X: Array | None  # hand-eye
+    landmark: IntArray  # (m,)
+    places: Array  # (l, 3)
+    cluster: IntArray  # (l,)
+    radius: float  # pieces of one flower lie within, m
+    noise: VarianceFactors  # what was found about the stated variances so far
+    errs_slowly: bool = False  # errors of observations cannot be told from drift of the poses
+
+
+def with_variances(frames: Frames, model: PoseModel, noise: VarianceFactors) -> tuple[Frames, PoseModel]:
+    """The session with the variances that were found instead of those that are stated."""
+    return replace(frames, covs=frames.covs * noise.flower), replace(model, cov=model.cov * noise.pose)
+
+
+def learn(world: World, smoother: BatchSmoother, estimate: Estimate) -> World:
+    """Take over what the smoothing found: poses, hand-eye transform, places, and how large the errors really are."""
+    found = variance_factors(smoother, estimate)
+    if world.errs_slowly:
+        found = VarianceFactors(1.0, 1.0, NO_WEIGHT)  # slow errors hide from residuals: the stated ones stay
+    noise = VarianceFactors(world.noise.flower * found.flower, world.noise.pose * found.pose, found.correlation)
+    return replace(world, T=estimate.T, X=estimate.X, places=estimate.places, noise=noise)
+
+
+def fewest_observations(frames: Frames, config: SmoothConfig) -> int:
+    """Observations of a flower that counts: a few frames cannot confirm anything, there every one stands."""
+    return int(min(config.min_observations, max(1, frames.n_frames // 4)))
+
+
+def scalar_var(frames: Frames, model: PoseModel) -> Array:
+    """Variance (m,) along any axis of each observation in the world, with what a pose errs."""
+    rotation, translation = model.cov[0, 0], model.cov[3, 3]
+    lever_sq = (frames.points**2).sum(axis=1)
+    return np.asarray(np.trace(frames.covs, axis1=1, axis2=2) / 3.0 + translation + rotation * lever_sq)
