@@ -7,11 +7,13 @@ import html
 from collections.abc import Sequence
 
 _STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 58rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
-table { border-collapse: collapse; margin: 0.8rem 0; font-variant-numeric: tabular-nums; }
+table { border-collapse: collapse; display: block; overflow-x: auto; margin: 0.8rem 0; }
+table { font-variant-numeric: tabular-nums; }
 th, td { border-bottom: 1px solid #ddd; padding: 0.2rem 0.7rem; text-align: right; }
-th:first-child, td:first-child { text-align: left; } th { font-weight: 600; border-bottom: 2px solid #888; }
+th:first-child, td:first-child { text-align: left; }
+td { white-space: nowrap; } th { font-weight: 600; border-bottom: 2px solid #888; }
 figure { margin: 1rem 0; } img { max-width: 100%; } figcaption { color: #555; font-size: 0.9rem; }
 @media (prefers-color-scheme: dark) { body { background: #fff; } }
 """

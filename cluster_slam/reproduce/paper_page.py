@@ -58,7 +58,8 @@ def _part1(done: Reproduction, pictures: dict[str, bytes]) -> list[str]:
         started anew for every level; the paper has alpha 1, beta 2, kappa 0, P = noise^2 I."""
     why = """The growing difference is not a nonlinearity that the transform fails to follow: it is the choice beta =
         2. The transform gives var(I) = 4 s^2 I + beta d^2 s^4 with d = 3 (N - 1), the truth is 4 s^2 I + 2 d s^4, so
-        that beta = 2 / d is exact. At the two lowest levels most of the difference is the Monte Carlo's own error."""
+        that beta = 2 / d is exact. At the two
+        lowest levels the Monte Carlo's own error is as large."""
     return [
         page.heading("Table I: the transform against Monte Carlo"),
         page.paragraph(protocol),
@@ -70,8 +71,8 @@ def _part1(done: Reproduction, pictures: dict[str, bytes]) -> list[str]:
 
 def _part2(rows: Sequence[MatchRow]) -> list[str]:
     body: list[tuple[object, ...]] = [
-        ("printed in the paper", "no padding", *PAPER_TABLE_2[0]),
-        ("printed in the paper", "0.005 m", *PAPER_TABLE_2[1]),
+        ("printed in the paper", "none", *PAPER_TABLE_2[0]),
+        ("printed in the paper", "0.005", *PAPER_TABLE_2[1]),
     ]
     body += [(r.reading, PADDING_WORDS[r.padding], r.correct_match, f"{r.false_positive_avg:.1f}") for r in rows]
     text = """This table does not reproduce. The protocol as described, with flowers in a cube of 1 m, gives 9,494

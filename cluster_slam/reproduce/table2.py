@@ -23,11 +23,11 @@ from tracking.gating import Gate
 SIZES = (3, 4, 5, 6)
 Padding = Literal["none", "sigma", "quadrature", "variance", "entry"]
 PADDING_WORDS: dict[Padding, str] = {
-    "none": "no padding",
-    "sigma": "0.005 m added to sigma",
-    "quadrature": "0.005 m added to sigma in quadrature",
-    "variance": "0.005^2 added to the descriptor's variances",
-    "entry": "0.005 added to the descriptor's variances",
+    "none": "none",
+    "sigma": "sigma + 0.005 m",
+    "quadrature": "in quadrature",
+    "variance": "variances + 0.005²",
+    "entry": "variances + 0.005",
 }
 
 
@@ -56,8 +56,8 @@ class MatchRow:
 READINGS = (
     Reading("literal: clean reference, noisy observation", paddings=("sigma", "quadrature", "variance", "entry")),
     Reading("both frames noisy", is_reference_noisy=True),
-    Reading("a tenth of the size, both frames noisy, later indices only", 0.1, True, True, True),
-    Reading("a tenth of the size, noisy reference, clean observation, later indices only", 0.1, True, False, True),
+    Reading("cube of 0.1 m, both frames noisy, later indices", 0.1, True, True, True),
+    Reading("cube of 0.1 m, noisy reference, later indices", 0.1, True, False, True),
 )
 
 
