@@ -54,9 +54,10 @@ class TemplateConfig:
 class ParticleConfig:
     """Options of the association where poses drift."""
 
-    n_particles: int = 100  # for a stretch; twice as many after a gap
+    n_starts: int = 2  # growths of the map in each direction of time; the likeliest is kept
+    n_particles: int = 60  # for a stretch; twice as many after a gap
     n_tries: int = 3  # of a stretch after a gap; the best is kept
-    stretch_points: int = 80  # points that are associated before all is smoothed again
+    stretch_points: int = 100  # points that are associated before all is smoothed again
     ahead_points: int = 40  # that are looked at beyond, before a stretch is believed
     odometry_scale: float = 1.5  # stated sigmas of odometry are taken times this ...
     odometry_dof: float = 2.0  # ... and errors of a usual step from Student's t: wheels slip, clocks are late

@@ -73,11 +73,12 @@ def trace_drifting(
     turned = frames.reversed()
     cov_back = (A @ cov_step @ np.swapaxes(A, 1, 2))[::-1]
     backward = _Tracer(turned, given[::-1], steps_of(given[::-1], cov_back, turned.stamps, config), config, rng)
-    grown, grown_back = forward.price(forward.grow()), backward.price(backward.grow())
-    if grown.cost <= grown_back.cost:
-        best = forward.redo(grown)
+    starts = [tracer.price(tracer.grow()) for _ in range(config.n_starts) for tracer in (forward, backward)]
+    likeliest = min(range(len(starts)), key=lambda k: starts[k].cost)
+    if likeliest % 2 == 0:
+        best = forward.redo(starts[likeliest])
     else:
-        best = _played_back(backward.redo(grown_back), turned)
+        best = _played_back(backward.redo(starts[likeliest]), turned)
     best = _anchored(best, given[0])
     steps = steps_of(given, cov_step, frames.stamps, config)
     weights = DriftSmoother(frames, steps, config.point_dof).step_weights(best.T)
@@ -161,14 +162,10 @@ class _Tracer:
         return self._merge(self._settle(state.T, state.label, state.places, price), price, 40)
 
     def redo(self, state: _State) -> _State:
-        """Associate every stretch again, with the landmarks that the others support, as long as that helps."""
+        """Associate every stretch again, with the landmarks that the others support, where that helps."""
         price = self.config.landmark_cost
-        for _ in range(2):
-            before = state.cost
-            for span in self._spans():
-                state = self._redo_span(state, span, price)
-            if before - state.cost < 1.0:
-                break
+        for span in self._spans():
+            state = self._redo_span(state, span, price)
         return state
 
     def _spans(self) -> list[tuple[int, int]]:
