@@ -16,7 +16,7 @@ from cluster_slam.records import Result, Session
 from cluster_slam.smoothing.finish import make_result
 from cluster_slam.smoothing.first import first_world
 from cluster_slam.smoothing.rounds import associate, drop_unsupported, mend, observations_err_slowly, regroup, solve
-from cluster_slam.smoothing.world import learn, with_variances
+from cluster_slam.smoothing.world import for_solving, learn, with_variances
 
 Progress = Callable[[str, float], None]
 
@@ -48,7 +48,7 @@ def smooth(
     clock.lap("landmarks")
     merged: list[tuple[int, int]] = []
     for i in range(config.max_rounds):
-        frames, model = with_variances(stated, stated_poses, world.noise)
+        frames, model = for_solving(stated, stated_poses, world)
         say(f"associating, round {i + 1}", 0.15 + 0.7 * i / config.max_rounds)
         before = world.landmark
         world = associate(frames, model, world, config)
@@ -72,7 +72,7 @@ def smooth(
     world = drop_unsupported(stated, world, config)
     say("smoothing all", 0.85)
     for n_iterations in (4, 2):
-        frames, model = with_variances(stated, stated_poses, world.noise)
+        frames, model = for_solving(stated, stated_poses, world)
         smoother, estimate = solve(frames, model, world, config, n_iterations)
         known, world = world.noise, learn(world, smoother, estimate)
         if abs(np.log(world.noise.flower / known.flower)) + abs(np.log(world.noise.pose / known.pose)) < 0.1:
@@ -82,6 +82,7 @@ def smooth(
     smoother.pairs = replace(
         smoother.pairs, sigma=smoother.pairs.sigma * np.sqrt(displacement_correlation(smoother, estimate))
     )
+    _, smoother.poses = with_variances(stated, stated_poses, world.noise)
     marginals = smoother.marginals(estimate)
     clock.lap("smoothing")
     return make_result(session, frames, world, smoother, estimate, marginals, config, seed, merged, clock.laps)

@@ -173,10 +173,15 @@ class BatchSmoother:
             graph.add(gtsam.JacobianFactor(keys.x, prior, -prior @ se3_log(inverse(model.X0) @ e.X), _UNIT[6]))
 
     def _cov_camera(self, e: Estimate) -> Array:
+        """Pose covariance in the camera's frame, at the lever that the solution started with.
+
+        Were it to follow the lever, longer levers would explain anything: a weight is no unknown.
+        """
         if e.X is None:
             return self.poses.cov
-        A = adjoint(inverse(e.X))
-        return A @ self.poses.cov @ A.T
+        if self._lever is None:
+            self._lever = adjoint(inverse(e.X))
+        return self._lever @ self.poses.cov @ self._lever.T
 
     def _add_odometry(self, graph: gtsam.GaussianFactorGraph, e: Estimate, predicted: Array) -> None:
         keys, cov_step = self.keys, self.poses.cov_step
@@ -210,6 +215,7 @@ class BatchSmoother:
             graph.add(gtsam.JacobianFactor(keys.b + s, eye / sigma, -mean / sigma, _UNIT[3]))
 
     _stretch_mean: Array | None = None
+    _lever: Array | None = None
 
     def step(self, e: Estimate) -> tuple[Estimate, float]:
         """One Gauss-Newton step and the size of the largest change of a place, m."""

@@ -7,6 +7,8 @@ unknowns of the transform are left; Cauchy weights keep swaying flowers from pul
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from cluster_slam.association.frames import point_jacobian
@@ -72,6 +74,15 @@ class _PieceProblem:
         return X, H, scale
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class HandEye:
+    """Transform (4, 4), the data's information (6, 6) about its tangent, and a projector on what must be held."""
+
+    X: Array
+    information: Array
+    held: Array
+
+
 def hand_eye_from_pieces(
     T_world_flange: Array,
     points: Array,
@@ -79,8 +90,9 @@ def hand_eye_from_pieces(
     labels: IntArray,
     X0: Array,
     prior_cov: Array,
-) -> tuple[Array, Array]:
-    """Hand-eye transform (4, 4) and the data's information (6, 6) about its tangent (applied on the right).
+    rotation_var: float,
+) -> HandEye:
+    """The hand-eye transform under which the pieces' points stand still.
 
     Parameters
     ----------
@@ -90,6 +102,7 @@ def hand_eye_from_pieces(
     labels : (q,) piece of each observation.
     X0 : (4, 4) the measured transform.
     prior_cov : (6, 6) how well it is known.
+    rotation_var : rad^2, by which the given rotations err: turns no larger than that tell nothing of the lever.
     """
     prior_information: Array = np.linalg.inv(prior_cov).astype(np.float64)
     problem = _PieceProblem(T_world_flange, points, var, labels)
@@ -97,7 +110,27 @@ def hand_eye_from_pieces(
     if np.sqrt(prior_cov[0, 0]) > _MULTI_START_RAD:
         start = _best_start(problem, X0, prior_information)
     X, H, _ = problem.solve(start, X0, prior_information, 30)
-    return X, H
+    held = _not_turned(problem, H, rotation_var)
+    if held.any():
+        X, H, _ = problem.solve(X0, X0, prior_information + 1e12 * held, 30)
+        free = np.eye(6) - held
+        H = free @ H @ free
+    return HandEye(X, H, held)
+
+
+def _not_turned(problem: _PieceProblem, H: Array, rotation_var: float, least: float = 5.0) -> Array:
+    """Projector (6, 6) on the shifts of which the turns of the flange say no more than their own errors would.
+
+    The lever is seen by turning. Errors of the given rotations look like turns of that size, and pull it astray.
+    """
+    weight = 1.0 / problem.var
+    chance = 2.0 * rotation_var * float(weight.sum())
+    shift = H[3:, 3:] - H[3:, :3] @ np.linalg.solve(H[:3, :3] + 1e-9 * np.eye(3), H[:3, 3:])
+    size, direction = np.linalg.eigh(shift)
+    lost = direction[:, size < least * chance]
+    held = np.zeros((6, 6))
+    held[3:, 3:] = lost @ lost.T
+    return held
 
 
 def _best_start(problem: _PieceProblem, X0: Array, prior_information: Array, n_max: int = 4000) -> Array:

@@ -29,6 +29,7 @@ def first_world(stated: Frames, stated_poses: PoseModel, config: SmoothConfig, r
     """Pieces, the hand-eye transform from them, landmarks from the pieces, and a first grouping."""
     X, cov_X = stated_poses.X0, stated_poses.cov_hand_eye
     noise = VarianceFactors(1.0, 1.0, 1.0)
+    held = np.zeros((6, 6))
     shortest = shortest_piece(stated)
     for _ in range(3):
         frames, model = with_variances(stated, stated_poses, noise)
@@ -41,15 +42,17 @@ def first_world(stated: Frames, stated_poses: PoseModel, config: SmoothConfig, r
         noise = VarianceFactors(noise.flower * factor, noise.pose * factor, 1.0)
         cov_before = cov_X
         if model.X0 is not None and long.any():
-            X, data = hand_eye_from_pieces(
+            found = hand_eye_from_pieces(
                 model.given[frames.frame[long]],
                 frames.points[long],
                 scalar_var(frames, model)[long],
                 pieces.labels[long],
                 model.X0,
                 model.cov_hand_eye,
+                float(model.cov[0, 0]),
             )
-            cov_X = np.linalg.inv(data + np.linalg.inv(model.cov_hand_eye))
+            X, held = found.X, found.held
+            cov_X = np.linalg.inv(found.information + np.linalg.inv(model.cov_hand_eye))
         if factor == 1.0 and (X is None or cov_X[0, 0] + cov_before[0, 0] < _CALM_HAND_EYE_RAD**2):
             break
     T = model.given if X is None else model.given @ X
@@ -60,7 +63,7 @@ def first_world(stated: Frames, stated_poses: PoseModel, config: SmoothConfig, r
     landmark, places = compact(keep, landmark), places[keep]
     presence = presence_of(frames.frame, landmark, len(places), frames.n_frames)
     cluster = group_flowers(places, presence, None, view_volume(frames), config.grouping, rng=rng)
-    return World(T, X, landmark, places, cluster, radius, noise)
+    return World(T, X, landmark, places, cluster, radius, noise, held)
 
 
 def innovation_factor(chi2: Array) -> float:

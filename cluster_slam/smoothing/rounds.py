@@ -56,7 +56,8 @@ def problem(frames: Frames, model: PoseModel, world: World) -> tuple[BatchSmooth
     """The graph of the session and where its solution starts."""
     of, frame, cluster = cluster_pairs(frames, world.landmark, world.cluster)
     d, cov = measured_displacements(frames, world.T, world.landmark, world.places, of, len(frame))
-    pose_var = model.cov[3, 3] + model.cov[0, 0] * float(np.median((frames.points**2).sum(axis=1), keepdims=False))
+    lever_sq = float(np.median((frames.points**2).sum(axis=1))) if len(frames) else 0.0
+    pose_var = model.cov[3, 3] + model.cov[0, 0] * lever_sq
     scale = motion_scale(d, cov + pose_var * np.eye(3), frame, cluster, frames.stamps)
     if np.bincount(world.cluster, minlength=1).max(initial=0) < 2:
         scale = np.zeros_like(scale)  # flowers that stand alone tell no sway from errors of their own

@@ -27,12 +27,24 @@ class World:
     cluster: IntArray  # (l,)
     radius: float  # pieces of one flower lie within, m
     noise: VarianceFactors  # what was found about the stated variances so far
+    held: Array  # (6, 6) projector on what of the hand-eye tangent the session cannot tell
     errs_slowly: bool = False  # errors of observations cannot be told from drift of the poses
 
 
 def with_variances(frames: Frames, model: PoseModel, noise: VarianceFactors) -> tuple[Frames, PoseModel]:
     """The session with the variances that were found instead of those that are stated."""
     return replace(frames, covs=frames.covs * noise.flower), replace(model, cov=model.cov * noise.pose)
+
+
+def for_solving(frames: Frames, model: PoseModel, world: World) -> tuple[Frames, PoseModel]:
+    """The same, with the hand-eye transform held at its prior where the session cannot tell it.
+
+    The estimated poses' own errors look like motion there, and would pull it away (errors in variables).
+    """
+    frames, model = with_variances(frames, model, world.noise)
+    free = np.eye(6) - world.held
+    cov = free @ model.cov_hand_eye @ free + 1e-12 * world.held
+    return frames, replace(model, cov_hand_eye=cov)
 
 
 def learn(world: World, smoother: BatchSmoother, estimate: Estimate) -> World:
