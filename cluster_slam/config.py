@@ -54,7 +54,7 @@ class TemplateConfig:
 class ParticleConfig:
     """Options of the association where poses drift."""
 
-    n_starts: int = 2  # growths of the map in each direction of time; the likeliest is kept
+    n_starts: int = 1  # growths of the map in each direction of time; the likeliest is kept
     n_particles: int = 60  # for a stretch; twice as many after a gap
     n_tries: int = 3  # of a stretch after a gap; the best is kept
     stretch_points: int = 100  # points that are associated before all is smoothed again

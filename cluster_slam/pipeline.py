@@ -8,15 +8,16 @@ from time import perf_counter
 
 import numpy as np
 
-from cluster_slam.association.frames import sort_by_frame
+from cluster_slam.association.frames import Frames, sort_by_frame
 from cluster_slam.config import SmoothConfig
+from cluster_slam.graph.batch import PoseModel
 from cluster_slam.graph.noise import pose_model
 from cluster_slam.graph.variance import displacement_correlation
 from cluster_slam.records import Result, Session
 from cluster_slam.smoothing.finish import make_result
 from cluster_slam.smoothing.first import first_world
 from cluster_slam.smoothing.rounds import associate, drop_unsupported, mend, observations_err_slowly, regroup, solve
-from cluster_slam.smoothing.world import for_solving, learn, with_variances
+from cluster_slam.smoothing.world import World, for_solving, learn, with_variances
 
 Progress = Callable[[str, float], None]
 
@@ -47,6 +48,39 @@ def smooth(
     world = first_world(stated, stated_poses, config, rng)
     clock.lap("landmarks")
     merged: list[tuple[int, int]] = []
+    if world.cov_step is None:  # where drift was followed, the association has been made with it
+        world, merged = _associate_and_smooth(stated, stated_poses, world, config, rng, say, clock)
+    if world.cov_step is None:
+        world = drop_unsupported(stated, world, config)
+    say("smoothing all", 0.85)
+    for n_iterations in (4, 2):
+        frames, model = for_solving(stated, stated_poses, world)
+        smoother, estimate = solve(frames, model, world, config, n_iterations)
+        known, world = world.noise, learn(world, smoother, estimate)
+        if abs(np.log(world.noise.flower / known.flower)) + abs(np.log(world.noise.pose / known.pose)) < 0.1:
+            break
+    if world.errs_slowly:  # all observations of a flower say the same: its place is as uncertain as one of them
+        smoother.correlation = float(np.bincount(smoother.landmark, minlength=1).max())
+    smoother.pairs = replace(
+        smoother.pairs, sigma=smoother.pairs.sigma * np.sqrt(displacement_correlation(smoother, estimate))
+    )
+    _, smoother.poses = with_variances(stated, stated_poses, world.noise)
+    marginals = smoother.marginals(estimate)
+    clock.lap("smoothing")
+    return make_result(session, frames, world, smoother, estimate, marginals, config, seed, merged, clock.laps)
+
+
+def _associate_and_smooth(
+    stated: Frames,
+    stated_poses: PoseModel,
+    world: World,
+    config: SmoothConfig,
+    rng: np.random.Generator,
+    say: Progress,
+    clock: _Clock,
+) -> tuple[World, list[tuple[int, int]]]:
+    """Associate, smooth, group, mend the landmarks, and again, until nothing changes."""
+    merged: list[tuple[int, int]] = []
     for i in range(config.max_rounds):
         frames, model = for_solving(stated, stated_poses, world)
         say(f"associating, round {i + 1}", 0.15 + 0.7 * i / config.max_rounds)
@@ -69,23 +103,7 @@ def smooth(
             break
         world, new = mend(frames, model, world, estimate, smoother.pairs, config)
         merged += new
-    world = drop_unsupported(stated, world, config)
-    say("smoothing all", 0.85)
-    for n_iterations in (4, 2):
-        frames, model = for_solving(stated, stated_poses, world)
-        smoother, estimate = solve(frames, model, world, config, n_iterations)
-        known, world = world.noise, learn(world, smoother, estimate)
-        if abs(np.log(world.noise.flower / known.flower)) + abs(np.log(world.noise.pose / known.pose)) < 0.1:
-            break
-    if world.errs_slowly:  # all observations of a flower say the same: its place is as uncertain as one of them
-        smoother.correlation = float(np.bincount(smoother.landmark, minlength=1).max())
-    smoother.pairs = replace(
-        smoother.pairs, sigma=smoother.pairs.sigma * np.sqrt(displacement_correlation(smoother, estimate))
-    )
-    _, smoother.poses = with_variances(stated, stated_poses, world.noise)
-    marginals = smoother.marginals(estimate)
-    clock.lap("smoothing")
-    return make_result(session, frames, world, smoother, estimate, marginals, config, seed, merged, clock.laps)
+    return world, merged
 
 
 class _Clock:

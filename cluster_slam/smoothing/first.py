@@ -7,6 +7,7 @@ import numpy as np
 from cluster_slam.association.displacement import (
     presence_of,
 )
+from cluster_slam.association.drifting import needs_tracing, trace_drifting
 from cluster_slam.association.frames import Frames, view_volume
 from cluster_slam.association.landmarks import flower_spacing, group_means, merge_pieces
 from cluster_slam.association.refine import compact, supported
@@ -26,6 +27,34 @@ _CALM_HAND_EYE_RAD = 0.005  # a hand-eye transform known so well does not spoil 
 
 
 def first_world(stated: Frames, stated_poses: PoseModel, config: SmoothConfig, rng: np.random.Generator) -> World:
+    """Landmarks to begin with, in one of two ways: poses that drift too far are followed, others can be relied upon."""
+    _, step = camera_covs(stated_poses, stated_poses.X0)
+    T = stated_poses.given if stated_poses.X0 is None else stated_poses.given @ stated_poses.X0
+    if step is not None and needs_tracing(stated, T, step):
+        return world_of_drifting_poses(stated, stated_poses, T, step, config, rng)
+    return world_of_pieces(stated, stated_poses, config, rng)
+
+
+def world_of_drifting_poses(
+    frames: Frames, model: PoseModel, T: Array, step: Array, config: SmoothConfig, rng: np.random.Generator
+) -> World:
+    """Follow the drift from stretch to stretch, landmarks growing with the estimate; the association is then known."""
+    traced = trace_drifting(frames, T, step, config.particles, rng=rng)
+    presence = presence_of(frames.frame, traced.label, len(traced.places), frames.n_frames)
+    return World(
+        T=traced.T,
+        X=model.X0,
+        landmark=traced.label,
+        places=traced.places,
+        cluster=group_flowers(traced.places, presence, None, view_volume(frames), config.grouping, rng=rng),
+        radius=float(np.sqrt(np.median(scalar_var(frames, model)))),
+        noise=VarianceFactors(1.0, 1.0, 1.0),
+        held=np.zeros((6, 6)),
+        cov_step=traced.cov_step if model.X0 is None else None,
+    )
+
+
+def world_of_pieces(stated: Frames, stated_poses: PoseModel, config: SmoothConfig, rng: np.random.Generator) -> World:
     """Pieces, the hand-eye transform from them, landmarks from the pieces, and a first grouping."""
     X, cov_X = stated_poses.X0, stated_poses.cov_hand_eye
     noise = VarianceFactors(1.0, 1.0, 1.0)

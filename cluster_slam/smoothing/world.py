@@ -28,6 +28,7 @@ class World:
     radius: float  # pieces of one flower lie within, m
     noise: VarianceFactors  # what was found about the stated variances so far
     held: Array  # (6, 6) projector on what of the hand-eye tangent the session cannot tell
+    cov_step: Array | None = None  # (n - 1, 6, 6) of odometry, where following its drift has told more than is stated
     errs_slowly: bool = False  # errors of observations cannot be told from drift of the poses
 
 
@@ -44,7 +45,8 @@ def for_solving(frames: Frames, model: PoseModel, world: World) -> tuple[Frames,
     frames, model = with_variances(frames, model, world.noise)
     free = np.eye(6) - world.held
     cov = free @ model.cov_hand_eye @ free + 1e-12 * world.held
-    return frames, replace(model, cov_hand_eye=cov)
+    step = model.cov_step if world.cov_step is None else world.cov_step
+    return frames, replace(model, cov_hand_eye=cov, cov_step=step)
 
 
 def learn(world: World, smoother: BatchSmoother, estimate: Estimate) -> World:
