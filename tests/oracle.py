@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from cluster_slam import pipeline
 from cluster_slam.association.frames import sort_by_frame
 from cluster_slam.config import SmoothConfig
 from cluster_slam.evaluation.trajectory import hand_eye_truth
 from cluster_slam.graph.noise import pose_model
 from cluster_slam.graph.variance import VarianceFactors
 from cluster_slam.records import Result, Session, Truth
+from cluster_slam.smoothing.finish import make_result
+from cluster_slam.smoothing.rounds import solve
+from cluster_slam.smoothing.world import World, for_solving, learn
 
 
 def smooth_with_truth(session: Session, truth: Truth, config: SmoothConfig | None = None) -> Result:
@@ -22,7 +24,7 @@ def smooth_with_truth(session: Session, truth: Truth, config: SmoothConfig | Non
     stated_poses = pose_model(session)
     ids, landmark, cluster = _true_landmarks(truth, stated.order)
     true_hand_eye = hand_eye_truth(session, truth)
-    world = pipeline._World(
+    world = World(
         T=truth.T_world_camera,
         X=None if session.T_flange_camera is None or true_hand_eye is None else true_hand_eye.T_flange_camera,
         landmark=landmark,
@@ -30,13 +32,14 @@ def smooth_with_truth(session: Session, truth: Truth, config: SmoothConfig | Non
         cluster=cluster,
         radius=1.0,
         noise=VarianceFactors(1.0, 1.0, 1.0),
+        held=np.zeros((6, 6)),
     )
     for _ in range(3):  # each time with the displacements and the noise that the one before found
-        frames, model = pipeline._with_variances(stated, stated_poses, world.noise)
-        smoother, estimate = pipeline._smooth(frames, model, world, config, 6)
-        world = pipeline._learn(world, smoother, estimate)
+        frames, model = for_solving(stated, stated_poses, world)
+        smoother, estimate = solve(frames, model, world, config, 6)
+        world = learn(world, smoother, estimate)
     marginals = smoother.marginals(estimate)
-    return pipeline._result(session, frames, world, smoother, estimate, marginals, config, 0, [], {})
+    return make_result(session, frames, world, smoother, estimate, marginals, config, 0, [], {})
 
 
 def _true_landmarks(truth: Truth, order: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
