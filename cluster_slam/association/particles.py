@@ -2,8 +2,8 @@
 
 Which landmark a point is stays a matter of chance while it is uncertain: every particle draws its own association, and
 those that later points contradict die out. Poses are drawn from their posterior given the frame's points (Montemerlo
-et al., "FastSLAM 2.0", 2003), associations by their likelihood, odometry errors from Student's t. All particles start
-from one smoothed estimate, so that they need to last for a stretch only.
+et al., "FastSLAM 2.0", 2003), associations by their likelihood, odometry errors from Student's t. They all
+start at one smoothed estimate, so that they need to last for a stretch only.
 """
 
 from __future__ import annotations
