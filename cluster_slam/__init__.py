@@ -13,14 +13,14 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from cluster_slam.evaluation import evaluate
     from cluster_slam.io.session import open_session
-    from cluster_slam.pipeline import smooth
+    from cluster_slam.pipeline.smooth import smooth
     from cluster_slam.simulate import simulate
 
 _PUBLIC = {
     "evaluate": "cluster_slam.evaluation",
     "open_session": "cluster_slam.io.session",
     "simulate": "cluster_slam.simulate",
-    "smooth": "cluster_slam.pipeline",
+    "smooth": "cluster_slam.pipeline.smooth",
 }
 __all__ = ["__version__", "evaluate", "open_session", "simulate", "smooth"]
 

@@ -54,9 +54,9 @@ def smoother(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
             raise told["raises"]
         return replace(MADE.result, session=session, status=told["status"], warnings=told["warnings"])
 
-    module = ModuleType("cluster_slam.pipeline")
+    module = ModuleType("cluster_slam.pipeline.smooth")
     module.smooth = smooth  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "cluster_slam.pipeline", module)
+    monkeypatch.setitem(sys.modules, "cluster_slam.pipeline.smooth", module)
     return told
 
 

@@ -107,7 +107,7 @@ def _work(
     from dataclasses import asdict, replace
 
     from cluster_slam.evaluation import evaluate
-    from cluster_slam.pipeline import smooth
+    from cluster_slam.pipeline.smooth import smooth
     from cluster_slam.report.page import render_report
 
     result = smooth(session, config=options, seed=seed, progress=progress)

@@ -1,4 +1,4 @@
-"""The methods, each to be read like the method section of a paper."""
+"""Smoothing of a whole session, to be read like the method section of a paper."""
 
 from __future__ import annotations
 
