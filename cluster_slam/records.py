@@ -66,6 +66,24 @@ class Observations:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One instant as it arrives live: when, the pose that the robot or the odometry gave, and what was seen.
+
+    Stamps are those of the camera's clock. Not validated: what a live source yields may be late, doubled or broken,
+    and whoever takes frames in says which he refuses.
+    """
+
+    stamp: float  # s
+    pose: Array  # (4, 4) T_world_flange or T_world_camera, whichever the session's ``pose_frame`` names
+    points: Array  # (q, 3) camera frame, m
+    covs: Array  # (q, 3, 3) camera frame, m^2
+    scores: Array | None = None  # (q,) detector's score, NaN where there is none
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Truth:
     """Ground truth, for evaluation and simulation only. Any part may be missing (None)."""
 
