@@ -1,0 +1,1 @@
+"""Sessions and results in the formats of other programs."""

@@ -1,0 +1,1 @@
+"""Recordings of other programs as sessions: one file a format."""
