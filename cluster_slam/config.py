@@ -85,6 +85,78 @@ class SmoothConfig:
     grouping: GroupingConfig = field(default_factory=GroupingConfig)
 
 
+@dataclass(frozen=True, slots=True)
+class OnlineConfig:
+    """Options of ``track``."""
+
+    gate_chi2: float = 16.0  # 3 degrees of freedom
+    slack_m: float = 0.0004  # what no covariance of a place tells: petals, rounding, a detector's habits
+    confirm_hits: int = 3  # of ...
+    confirm_of: int = 5  # ... the last so many looks: then a flower is a landmark
+    forget_looks: int = 8  # looks in vain after which a tentative flower is forgotten
+    clutter_per_frame: float = 0.5  # expected before the data say how many there are
+    lost_s: float = 2.0  # a cluster unseen for so long is lost (and comes back as itself)
+    keyframe_s: float = 0.2  # the map is solved this often
+    regroup_s: float = 1.0  # flowers are grouped this often, sooner where new ones were confirmed
+    calibrate_s: float = 10.0  # the hand-eye transform is estimated for so long at most, then frozen
+    undo_s: float = 3.0  # associations can be undone for so long
+    follow: TemplateConfig = field(default_factory=TemplateConfig)
+    grouping: GroupingConfig = field(default_factory=GroupingConfig)
+
+
+@dataclass(frozen=True, slots=True)
+class GrowthConfig:
+    """How plants change over days. Priors: what sessions show corrects them."""
+
+    drift_m_per_day: float = 0.003  # RMS norm of a cluster's drift; wrong by a factor of two is covered
+    common_share: float = 0.25  # of it: what all clusters share, which no alignment can see
+    walk_m_per_sqrt_day: float = 0.0007  # random walk of a cluster, one sigma an axis
+    flower_walk_m_per_sqrt_day: float = 0.0005  # of a flower within its cluster
+    setting_m: float = 0.0005  # one sigma an axis: how a cluster hangs another time, even on the same day
+    flower_setting_m: float = 0.0005  # the same of a flower within its cluster
+    size_per_day: float = 0.01  # relative growth of all lengths within a cluster
+    size_sigma_per_day: float = 0.01  # of that rate, one sigma
+    lost_per_day: float = 0.02  # share of the flowers
+    new_per_day: float = 0.03  # share of the flowers
+
+
+@dataclass(frozen=True, slots=True)
+class MatchConfig:
+    """How a session's constellation is matched with a plant's."""
+
+    n_seeds: int = 120  # triples of the session from which poses are guessed
+    max_poses: int = 6000  # guesses that are scored
+    n_kept: int = 40  # guesses that are looked at closely
+    wide: float = 2.5  # drift may also be so many times larger ...
+    wide_share: float = 0.25  # ... for this share of the clusters
+    seen_share: float = 0.85  # of the flowers that are there, in a session that looked at them
+    ghosts: float = 0.15  # false or new flowers beside each cluster, mean
+    evidence: float = 8.0  # log of the Bayes factor at which a pose is believed
+    margin: float = 6.0  # log of the Bayes factor to the next pose or plant, else it is ambiguous
+    scale_min: float = 0.9  # with a similarity: the session's unit of length against the map's
+    scale_max: float = 1.1
+
+
+@dataclass(frozen=True, slots=True)
+class PresenceConfig:
+    """Whether something is still there when it was not seen."""
+
+    hidden_share: float = 0.1  # of the flowers: not seen in a whole session although it looked there
+    cluster_hidden_share: float = 0.15  # of the clusters: hidden as a whole
+    min_views: int = 3  # frames that must have had it in view; fewer where the session has few
+    present_above: float = 0.5  # presence above this is "present" ...
+    gone_below: float = 0.1  # ... and below this "gone"; else "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class MapConfig:
+    """Options of ``map``."""
+
+    growth: GrowthConfig = field(default_factory=GrowthConfig)
+    match: MatchConfig = field(default_factory=MatchConfig)
+    presence: PresenceConfig = field(default_factory=PresenceConfig)
+
+
 C = TypeVar("C")
 
 

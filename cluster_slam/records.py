@@ -208,3 +208,79 @@ class Result:
     warnings: tuple[str, ...] = ()
     merged: tuple[tuple[int, int], ...] = ()
     status: Literal["ok", "poor"] = "ok"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Constellation:
+    """Clusters and flowers at rest as one session brings them to a map, in the session's own world."""
+
+    session: str
+    start: float  # s, first frame; NaN where unknown
+    end: float  # s, last frame
+    flower_ids: IntArray  # (f,) the session's own
+    flower_cluster_ids: IntArray  # (f,)
+    flowers: Array  # (f, 3) world
+    flower_covs: Array  # (f, 3, 3)
+    cluster_ids: IntArray  # (c,) increasing
+    descriptors: Array  # (c, 2) inertia (m^2), mean distance (m)
+    descriptor_covs: Array  # (c, 2, 2)
+    plant: str | None = None  # as the session names it
+    viewpoint: Array | None = None  # (3,) mean camera position, world
+
+    @property
+    def clusters(self) -> Array:
+        """Centroids (c, 3): the unweighted mean of each cluster's flowers."""
+        row = np.searchsorted(self.cluster_ids, self.flower_cluster_ids)
+        total = np.zeros((len(self.cluster_ids), 3))
+        np.add.at(total, row, self.flowers)
+        return total / np.maximum(np.bincount(row, minlength=len(total)), 1)[:, None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlantMap:
+    """One plant of a map in the plant's own frame, with persistent ids.
+
+    Each cluster and flower is where it was at its cluster's ``cluster_time``; ``cluster_slam.constellation.growth.at``
+    moves a whole plant to another time, with covariances that have grown. Rates are per second. ``presence`` is the
+    probability that it is still there. Clusters that have lost all flowers keep their row.
+    """
+
+    name: str
+    cluster_ids: IntArray  # (c,) increasing
+    clusters: Array  # (c, 3) map, at cluster_time
+    cluster_covs: Array  # (c, 3, 3) of the displacement that all flowers of the cluster share
+    cluster_time: Array  # (c,) s, what position and covariance are of; NaN where unknown
+    velocities: Array  # (c, 3) m/s, learned drift
+    velocity_covs: Array  # (c, 3, 3)
+    position_velocity_covs: Array  # (c, 3, 3)
+    growth_rates: Array  # (c,) 1/s, relative growth of all lengths within the cluster
+    growth_vars: Array  # (c,)
+    n_flowers: IntArray  # (c,)
+    descriptors: Array  # (c, 2) inertia (m^2), mean distance (m)
+    descriptor_covs: Array  # (c, 2, 2)
+    cluster_first_seen: Array  # (c,) s
+    cluster_last_seen: Array  # (c,) s
+    cluster_last_looked_at: Array  # (c,) s
+    cluster_presence: Array  # (c,)
+    flower_ids: IntArray  # (f,) increasing
+    flower_cluster_ids: IntArray  # (f,)
+    flowers: Array  # (f, 3) map, at the cluster_time of its cluster
+    flower_covs: Array  # (f, 3, 3) of its place within the cluster: independent of cluster_covs
+    flower_first_seen: Array  # (f,) s
+    flower_last_seen: Array  # (f,) s
+    flower_last_looked_at: Array  # (f,) s
+    flower_presence: Array  # (f,)
+    viewpoint: Array | None = None  # (3,) mean camera position over the sessions, map
+    last_session: float = float("nan")  # s, end of the latest session
+    drift_rate: float = 0.003  # m/day, RMS norm of the drift of a cluster, as learned so far
+
+    @property
+    def flower_rows(self) -> IntArray:
+        """Row of each flower's cluster (f,)."""
+        return np.searchsorted(self.cluster_ids, self.flower_cluster_ids).astype(np.int64)
+
+    @property
+    def flower_total_covs(self) -> Array:
+        """Covariances (f, 3, 3) of the flowers' positions: the cluster's and their own."""
+        total: Array = self.cluster_covs[self.flower_rows] + self.flower_covs
+        return total

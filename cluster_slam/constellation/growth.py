@@ -1,0 +1,63 @@
+"""Where a plant's clusters and flowers are at another time, and how sure that is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from cluster_slam.config import GrowthConfig
+from cluster_slam.geometry import Array
+from cluster_slam.records import PlantMap
+
+DAY_S = 86400.0
+
+
+def at(plant: PlantMap, time: float, config: GrowthConfig | None = None) -> PlantMap:
+    """The plant as it should be at another time: drifted, grown, with covariances that have grown too.
+
+    The gap is counted for each cluster by itself, since the time that its state is of. Where either time is unknown
+    (NaN) no time has passed.
+
+    Parameters
+    ----------
+    plant
+        As the map holds it.
+    time
+        s; before the state's time too (the drift is undone, the uncertainty grows all the same).
+
+    Returns
+    -------
+    PlantMap
+        With ``cluster_time`` at ``time``. ``cluster_covs`` are (P + (C + C') dt + V dt^2 + walk^2 |dt| + setting^2),
+        of what all flowers of a cluster share; ``flower_covs`` of each flower's place in its cluster.
+    """
+    config = config or GrowthConfig()
+    dt = gaps(plant, time)
+    days = np.abs(dt) / DAY_S
+    passed = dt != 0.0
+    cross = plant.position_velocity_covs + np.swapaxes(plant.position_velocity_covs, 1, 2)
+    walk_sq = config.walk_m_per_sqrt_day**2 * days + config.setting_m**2 * passed
+    covs = plant.cluster_covs + cross * dt[:, None, None] + plant.velocity_covs * (dt**2)[:, None, None]
+    covs = covs + walk_sq[:, None, None] * np.eye(3)
+    clusters = plant.clusters + plant.velocities * dt[:, None]
+    row = plant.flower_rows
+    size = np.exp(plant.growth_rates * dt)[row]
+    offsets = plant.flowers - plant.clusters[row]
+    flower_walk = config.flower_walk_m_per_sqrt_day**2 * days[row] + config.flower_setting_m**2 * passed[row]
+    radial = offsets[:, :, None] * offsets[:, None, :] * (plant.growth_vars * dt**2)[row][:, None, None]
+    return replace(
+        plant,
+        clusters=clusters,
+        cluster_covs=0.5 * (covs + np.swapaxes(covs, 1, 2)),
+        cluster_time=np.where(np.isnan(time), plant.cluster_time, np.full(len(dt), time)),
+        position_velocity_covs=plant.position_velocity_covs + plant.velocity_covs * dt[:, None, None],
+        flowers=clusters[row] + size[:, None] * offsets,
+        flower_covs=plant.flower_covs + flower_walk[:, None, None] * np.eye(3) + radial,
+    )
+
+
+def gaps(plant: PlantMap, time: float) -> Array:
+    """Seconds (c,) from each cluster's state to ``time``; 0 where one of the two is unknown."""
+    gap: Array = np.nan_to_num(time - plant.cluster_time, nan=0.0)
+    return gap
