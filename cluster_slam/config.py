@@ -157,6 +157,23 @@ class MapConfig:
     presence: PresenceConfig = field(default_factory=PresenceConfig)
 
 
+@dataclass(frozen=True, slots=True)
+class LocaliseConfig:
+    """Options of ``localise``."""
+
+    sure_probability: float = 0.9999  # a frame is located from here on
+    map_prior: float = 0.5  # that a frame shows a plant of the map at all
+    min_clusters: int = 2  # one cluster never gives a sure pose
+    min_flowers: int = 4  # three points fit three flowers somewhere in any map
+    n_triples: int = 24  # of a frame's points, from which poses are guessed: at most
+    n_triples_sure: int = 6  # after which a pose that explains a sure share of the points ends the search
+    sure_share: float = 0.6  # of the points
+    n_refined: int = 12  # guesses that are refined with all that is known
+    sway_m: float = 0.002  # of a cluster from rest, one sigma an axis, before the session has shown its own
+    detection: float = 0.8  # probability that a flower in view is detected
+    unmapped: float = 0.2  # share of the points that the map does not have: false ones, new flowers
+
+
 C = TypeVar("C")
 
 

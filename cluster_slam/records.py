@@ -284,3 +284,43 @@ class PlantMap:
         """Covariances (f, 3, 3) of the flowers' positions: the cluster's and their own."""
         total: Array = self.cluster_covs[self.flower_rows] + self.flower_covs
         return total
+
+
+LostReason = Literal["", "ambiguous", "too_few", "no_match"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseHypotheses:
+    """Poses that explain a frame, best first within each frame."""
+
+    frame: IntArray  # (h,)
+    rank: IntArray  # (h,) from 1
+    probability: Array  # (h,)
+    T_map_camera: Array  # (h, 4, 4)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionLocalisation:
+    """Where the frames of a session are in a map. A frame is located exactly where its reason is empty."""
+
+    session: Session
+    reasons: tuple[LostReason, ...]  # (n,) why a frame is lost
+    plants: tuple[str, ...]  # (n,) of the best hypothesis, "" where there is none
+    n_inliers: IntArray  # (n,) points that are flowers of the map
+    probability: Array  # (n,) of the best hypothesis
+    T_map_camera: Array  # (n, 4, 4) NaN where lost
+    covs: Array  # (n, 6, 6) tangent on the right, NaN where lost
+    flower_ids: IntArray  # (m,) of the map, -1 = none
+    cluster_ids: IntArray  # (m,) of the map, -1 = none
+    hypotheses: PoseHypotheses
+    config: dict[str, Any] = field(default_factory=dict)
+    seed: int = 0
+    timings_s: dict[str, float] = field(default_factory=dict)
+    estimated_noise: dict[str, float] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    status: Literal["ok", "poor"] = "ok"
+
+    @property
+    def is_located(self) -> BoolArray:
+        """Which frames are located (n,)."""
+        return np.array([reason == "" for reason in self.reasons], dtype=bool)

@@ -12,7 +12,18 @@ from typing import Annotated, NoReturn
 import typer
 
 from cluster_slam import __version__
-from cluster_slam.cli import check, compare, evaluate, figures, record, reproduce, rtde_emulator, simulate, smooth
+from cluster_slam.cli import (
+    check,
+    compare,
+    evaluate,
+    figures,
+    localise,
+    record,
+    reproduce,
+    rtde_emulator,
+    simulate,
+    smooth,
+)
 from cluster_slam.errors import ClusterSlamError
 
 EXIT_POOR = 1  # it ran, but the result is poor
@@ -54,6 +65,7 @@ app.command("evaluate")(evaluate.command)
 app.command("check")(check.command)
 app.command("figures")(figures.command)
 app.command("compare-descriptors")(compare.command)
+app.command("localise")(localise.command)
 app.command("record")(record.command)
 app.command("rtde-emulator")(rtde_emulator.command)
 app.add_typer(reproduce.app, name="reproduce")

@@ -1,0 +1,83 @@
+"""``cluster-slam localise``: where the camera is in a saved map."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cluster_slam.cli.options import ConfigOption, JsonOption, QuietOption, SessionArgument, SetOption, configured
+from cluster_slam.cli.progress import StageProgress
+from cluster_slam.cli.summary import print_json, print_table, print_warnings
+from cluster_slam.config import LocaliseConfig
+
+if TYPE_CHECKING:
+    from cluster_slam.records import SessionLocalisation
+
+
+def command(
+    session: SessionArgument,
+    map_file: Annotated[Path, typer.Option("--map", "-m", metavar="MAP", help="Map file.", show_default=False)],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="OUT", help="Result folder; an earlier result in it is replaced.")
+    ],
+    independent: Annotated[
+        bool, typer.Option("--independent", help="Every frame by itself; poses.txt gives stamps only.")
+    ] = False,
+    config: ConfigOption = None,
+    settings: SetOption = None,
+    level: Annotated[
+        int | None, typer.Option("--level", help="3 flowers, 2 detections; default: the highest.", show_default=False)
+    ] = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> int:
+    """Say where the camera was in a map, frame by frame, with no prior, and how sure that is.
+
+    A frame is located only where the pose is sure; all others are lost, with the reason. Of poses.txt only the motion
+    from frame to frame is used.
+
+    Example: cluster-slam localise session --map field.map -o out/where
+    """
+    from cluster_slam.io.localisation import write_localisation
+    from cluster_slam.io.map import open_map
+    from cluster_slam.io.result import check_output
+    from cluster_slam.io.session import open_session
+    from cluster_slam.pipeline.localise import localise
+
+    check_output(out)
+    options = configured(LocaliseConfig(), config, settings or [])
+    opened = open_session(session, level=level)
+    with open_map(map_file) as store:
+        plants = store.plants()
+    with StageProgress(is_shown=not (quiet or as_json)) as progress:
+        found = localise(opened, plants, config=options, independent=independent, progress=progress)
+        write_localisation(found, out)
+    if as_json:
+        print_json({**json.loads((out / "run.json").read_text("utf-8")), "out": str(out)})
+    elif not quiet:
+        _tell(found, out)
+    if found.status == "poor":
+        print_warnings([f"the result is poor: {'; '.join(found.warnings)}"])
+    return 0 if found.status == "ok" else 1
+
+
+def _tell(found: SessionLocalisation, out: Path) -> None:
+    import numpy as np
+
+    print_warnings(found.warnings if found.status == "ok" else ())
+    n, located = found.session.n_frames, int(found.is_located.sum())
+    lost = [(r, found.reasons.count(r)) for r in ("ambiguous", "too_few", "no_match")]
+    rows = [
+        ("session", found.session.id),
+        ("frames", str(n)),
+        ("located", f"{located} ({100 * located / n:.1f} %)"),
+        ("lost", ", ".join(f"{count} {reason}" for reason, count in lost if count) or "none"),
+    ]
+    if located:
+        var = np.nanmedian(np.diagonal(found.covs[found.is_located], axis1=1, axis2=2), axis=0)
+        turn, shift = np.degrees(np.sqrt(var[:3].sum())), 1e3 * np.sqrt(var[3:].sum())
+        rows.append(("sure to (one sigma, median)", f"{shift:.2f} mm, {turn:.3f} deg"))
+    print_table(f"cluster-slam localise: {found.status}", [*rows, ("result", str(out))])

@@ -1,0 +1,111 @@
+"""The flowers of one plant as a map predicts them for one instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from cluster_slam.constellation import growth
+from cluster_slam.errors import InputError
+from cluster_slam.geometry import Array
+from cluster_slam.records import IntArray, PlantMap
+
+_GONE_BELOW = 0.1  # presence
+_LEAST_SIGMA_M = 1e-5  # a place that is stated exact still has an invertible covariance
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Flowers of one plant in the plant's own frame of the map.
+
+    ``covs`` is of each flower about its cluster, ``shared_covs`` of the error that all flowers of a cluster share: how
+    well its place is known now, with what it may have drifted since it was last seen.
+    """
+
+    plant: str
+    flower_ids: IntArray  # (f,)
+    cluster_ids: IntArray  # (f,) cluster of each flower
+    positions: Array  # (f, 3) map, m
+    covs: Array  # (f, 3, 3) m^2
+    shared_covs: Array  # (c, 3, 3) m^2, in the order of the increasing cluster ids
+
+    def __len__(self) -> int:
+        return len(self.flower_ids)
+
+    @cached_property
+    def cluster(self) -> IntArray:
+        """Index of each flower's cluster (f,), 0 to n_clusters - 1."""
+        return np.unique(self.cluster_ids, return_inverse=True)[1].astype(np.int64)
+
+    @property
+    def n_clusters(self) -> int:
+        return len(self.shared_covs)
+
+    @cached_property
+    def spread(self) -> float:
+        """Standard deviation an axis of a flower about its cluster's centroid, m; 0 where all clusters are single."""
+        count = np.bincount(self.cluster, minlength=self.n_clusters)
+        mean = np.stack([np.bincount(self.cluster, x, self.n_clusters) for x in self.positions.T], axis=1)
+        off = self.positions - (mean / count[:, None])[self.cluster]
+        free = 3.0 * float((count - 1).sum())
+        return float(np.sqrt((off**2).sum() / free)) if free else 0.0
+
+
+def landmarks(
+    positions: Array,
+    cluster_ids: IntArray,
+    *,
+    flower_ids: IntArray | None = None,
+    covs: Array | None = None,
+    shared_covs: Array | None = None,
+    plant: str = "plant",
+) -> Landmarks:
+    """Landmarks from positions (f, 3) and what else is known, checked.
+
+    Raises
+    ------
+    InputError
+        No landmark, a value that is not finite, or an id given twice.
+    """
+    positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
+    n = len(positions)
+    if n == 0:
+        raise InputError(f"the map of plant {plant!r} is empty, expected flowers to localise by")
+    ids = np.arange(n, dtype=np.int64) if flower_ids is None else np.asarray(flower_ids, dtype=np.int64)
+    cluster_ids = np.asarray(cluster_ids, dtype=np.int64)
+    n_clusters = len(np.unique(cluster_ids))
+    if not np.isfinite(positions).all():
+        raise InputError(f"the map of plant {plant!r} holds a position that is not finite")
+    if len(np.unique(ids)) != n:
+        raise InputError(f"the map of plant {plant!r} holds a flower id twice")
+    floor = _LEAST_SIGMA_M**2 * np.eye(3)
+    own = np.zeros((n, 3, 3)) if covs is None else np.asarray(covs, dtype=np.float64)
+    shared = np.zeros((n_clusters, 3, 3)) if shared_covs is None else np.asarray(shared_covs, dtype=np.float64)
+    return Landmarks(plant, ids, cluster_ids, positions, own + floor, shared + floor)
+
+
+def landmarks_at(plant: PlantMap, time: float) -> Landmarks:
+    """The flowers of a plant of the map as they should stand at a time (s; NaN: as the map holds them).
+
+    Flowers that are gone for sure are left out.
+
+    Raises
+    ------
+    InputError
+        The plant has no flowers.
+    """
+    then = growth.at(plant, time)
+    there = then.flower_presence >= _GONE_BELOW
+    if not there.any():
+        raise InputError(f"the map of plant {plant.name!r} is empty, expected flowers to localise by")
+    clusters = np.unique(then.flower_cluster_ids[there])
+    return landmarks(
+        then.flowers[there],
+        then.flower_cluster_ids[there],
+        flower_ids=then.flower_ids[there],
+        covs=then.flower_covs[there],
+        shared_covs=then.cluster_covs[np.searchsorted(then.cluster_ids, clusters)],
+        plant=plant.name,
+    )
