@@ -23,7 +23,9 @@ from cluster_slam.cli import (
     rtde_emulator,
     simulate,
     smooth,
+    track,
 )
+from cluster_slam.cli import map as map_commands
 from cluster_slam.errors import ClusterSlamError
 
 EXIT_POOR = 1  # it ran, but the result is poor
@@ -60,6 +62,7 @@ def _options(
 
 
 app.command("smooth", short_help="Turn a session into a map of flower clusters.")(smooth.command)
+app.command("track", short_help="Follow clusters frame by frame, as if live.")(track.command)
 app.command("simulate")(simulate.command)
 app.command("evaluate")(evaluate.command)
 app.command("check")(check.command)
@@ -69,6 +72,7 @@ app.command("localise")(localise.command)
 app.command("record")(record.command)
 app.command("rtde-emulator")(rtde_emulator.command)
 app.add_typer(reproduce.app, name="reproduce")
+app.add_typer(map_commands.app, name="map")
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:

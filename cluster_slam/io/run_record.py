@@ -17,6 +17,7 @@ class RunRecord(BaseModel):
 
     model_config = ConfigDict(extra="ignore", frozen=True)
     command: str = "smooth"
+    session: str | None = None
     session_path: Path | None = None
     level: int | None = None
     config: dict[str, Any] = {}

@@ -1,0 +1,137 @@
+"""Who is who, once the pose is known: clusters and single flowers one to one, new and gone, with probabilities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cluster_slam.constellation.match import Found
+from cluster_slam.constellation.units import MATCH_FLOOR_M
+from cluster_slam.geometry import Array
+from cluster_slam.records import Constellation, IntArray
+from tracking.assignment import assign
+from tracking.reid import association_probabilities
+
+ELSEWHERE = 0.01  # prior of a flower that was grouped with another cluster than the map has it in
+TAIL_SHARE, TAIL = 0.05, 3.0  # of the flowers: errors so many times as large
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identities:
+    """Rows of the plant for each cluster and flower of a session, -1 where the plant does not have it."""
+
+    cluster: IntArray  # (c,)
+    cluster_probability: Array  # (c,) of this decision, match or new
+    flower: IntArray  # (f,)
+    flower_probability: Array  # (f,)
+
+
+def nobody(session: Constellation) -> Identities:
+    """All are new: the plant's first session."""
+    n, f = len(session.cluster_ids), len(session.flower_ids)
+    return Identities(np.full(n, -1), np.ones(n), np.full(f, -1), np.ones(f))
+
+
+def identify(session: Constellation, match: Found, pose_probability: float) -> Identities:
+    """Identities under the pose of a match.
+
+    Parameters
+    ----------
+    pose_probability
+        That the pose is right at all; every match can be no surer than that.
+    """
+    ratio = _flower_ratios(session, match)
+    rows, cols = assign(-ratio, 0.0)
+    pairs, new, _ = association_probabilities(ratio)
+    flower = np.full(len(session.flower_ids), -1)
+    flower[rows] = cols
+    probability = np.where(flower >= 0, pose_probability * pairs[np.arange(len(flower)), flower], new)
+    cluster, cluster_probability = _clusters(session, match, flower, probability, pose_probability)
+    return Identities(cluster, cluster_probability, flower, np.clip(probability, 0.0, 1.0))
+
+
+def _flower_ratios(session: Constellation, match: Found) -> Array:
+    """Log likelihood ratios (f, g) of all pairs of flowers, given what their clusters did."""
+    scene, found, space = match.scene, match.best, match.space
+    points = found.pose.apply(space.session(session.flowers))[0]
+    d = points.shape[1]
+    where, var = _expected(match)
+    own = match.scale**2 * np.trace(session.flower_covs, axis1=1, axis2=2) / 3.0
+    squared = ((points[:, None] - where) ** 2).sum(-1)
+    total = own[:, None] + var
+    log_density = np.logaddexp(
+        np.log1p(-TAIL_SHARE) - 0.5 * squared / total - 0.5 * d * np.log(2 * np.pi * total),
+        np.log(TAIL_SHARE) - 0.5 * squared / (TAIL**2 * total) - 0.5 * d * np.log(2 * np.pi * TAIL**2 * total),
+    )
+    seen = np.clip(scene.config.seen_share * match.plant.flower_presence, 1e-3, 0.999)
+    null, prior = _strangers(session, match)
+    ratios: Array = log_density + np.log(seen / (1 - seen)) - null[:, None] + prior
+    return ratios
+
+
+def _expected(match: Found) -> tuple[Array, Array]:
+    """Where the plant's flowers are expected (g, d), and their variance (g,), after what their clusters did."""
+    scene, found = match.scene, match.best
+    known = scene.known
+    offset = np.zeros(known.centres.shape)
+    var_left = known.var_offset.copy()
+    if not match.single:
+        offset[found.known] = found.offset
+        weight = np.where(
+            found.partner >= 0,
+            1.0 / (MATCH_FLOOR_M**2 + scene.query.groups.variances[found.query]),
+            0.0,
+        ).sum(axis=1)
+        var_left[found.known] = 1.0 / (1.0 / known.var_offset[found.known] + weight)
+    n = len(match.plant.flowers)
+    where, var = np.zeros((n, known.centres.shape[1])), np.ones(n)
+    unit, member = np.nonzero(known.groups.mask)
+    row = known.flower[unit, member]
+    where[row] = known.groups.points[unit, member] + offset[unit]
+    var[row] = known.groups.variances[unit, member] + var_left[unit]
+    return where, var
+
+
+def _strangers(session: Constellation, match: Found) -> tuple[Array, Array]:
+    """Log density (f,) of each flower if it is new, and log prior (f, g) of the clusters of a pair being the same."""
+    scene, found = match.scene, match.best
+    background = scene.background
+    row = np.searchsorted(session.cluster_ids, session.flower_cluster_ids)
+    size = np.bincount(row, minlength=len(session.cluster_ids))[row]
+    alone = (background.log_group_density + (size - 1) * background.log_density) / size
+    if match.single:
+        return alone, np.zeros((len(row), len(match.plant.flowers)))
+    partner = np.full(len(session.cluster_ids), -1)
+    partner[scene.query.cluster[found.query]] = scene.known.cluster[found.known]
+    beside = np.log(background.n_new) + background.log_density
+    null = np.where(partner[row] >= 0, np.maximum(beside, alone), alone)
+    same = partner[row][:, None] == match.plant.flower_rows
+    return null, np.where(same, 0.0, np.log(ELSEWHERE))
+
+
+def _clusters(
+    session: Constellation, match: Found, flower: IntArray, flower_probability: Array, pose_probability: float
+) -> tuple[IntArray, Array]:
+    """Partners (c,) of the clusters by the flowers that they share, one to one, and probabilities."""
+    scene, found = match.scene, match.best
+    n, m = len(session.cluster_ids), len(match.plant.cluster_ids)
+    row = np.searchsorted(session.cluster_ids, session.flower_cluster_ids)
+    shared = np.zeros((n, m))
+    is_match = flower >= 0
+    np.add.at(shared, (row[is_match], match.plant.flower_rows[flower[is_match]]), flower_probability[is_match])
+    a, b = assign(-shared, -1e-6)
+    partner = np.full(n, -1)
+    partner[a] = b
+    probability = np.ones(n)
+    if match.single:
+        probability[a] = np.minimum(1.0, shared[a, b] / np.maximum(shared[a].sum(axis=1), 1e-9)) * pose_probability
+        best = np.zeros(n)
+        np.maximum.at(best, row, np.where(is_match, flower_probability, 0.0))
+        return partner, np.where(partner >= 0, np.minimum(probability, best), 1.0 - best)
+    pairs, new, _ = association_probabilities(found.table)
+    table, fresh = np.zeros((n, m)), np.ones(n)
+    table[np.ix_(scene.query.cluster, scene.known.cluster)] = pairs
+    fresh[scene.query.cluster] = new
+    probability = np.where(partner >= 0, table[np.arange(n), partner] * pose_probability, fresh)
+    return partner, np.clip(probability, 0.0, 1.0)

@@ -1,0 +1,231 @@
+"""A session's constellation against a plant's with nothing known of the pose: what fits, how well, what else fits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cluster_slam.config import GrowthConfig, MatchConfig
+from cluster_slam.constellation.explain import Explained, Scene, explain, matched_pairs, refine
+from cluster_slam.constellation.fit import Pairs, pose_covariance
+from cluster_slam.constellation.growth import DAY_S
+from cluster_slam.constellation.plane import Space, spaces
+from cluster_slam.constellation.poses import Places, best_distinct, guess_poses, quick_scores
+from cluster_slam.constellation.units import Units, background_of, log_volume, plant_units, session_units
+from cluster_slam.constellation.warp import warped
+from cluster_slam.geometry import Array
+from cluster_slam.records import Constellation, PlantMap
+
+SINGLES_UP_TO = 80  # flowers on each side that are also matched one by one
+N_REFINED = 6
+REPEATED_SHARE = 0.7  # of the centres: a second pose that puts so many on others means a repeated structure
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """The best pose: p_map = T_map_world * (scale * p_world), and what it explains."""
+
+    plant: PlantMap  # at the session's time, without the flowers that are long gone
+    T_map_world: Array  # (4, 4)
+    scale: float
+    cov: Array  # (6, 6) of the tangent on the right
+    space: Space
+    scene: Scene
+    best: Explained
+    single: bool  # flowers one by one, not cluster by cluster
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Match:
+    """How a session fits a plant."""
+
+    name: str  # of the plant
+    log_ratio: float  # log likelihood of the best pose over "another plant"
+    evidence: float  # the same with all poses integrated out (Laplace): log of a Bayes factor
+    runner_up: float  # evidence of the best pose that says something else
+    is_repeated: bool  # the layout of the clusters fits in several ways
+    found: Found | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate:
+    space: Space
+    scene: Scene
+    found: Explained
+    evidence: float
+    single: bool
+
+
+def match(
+    session: Constellation,
+    plant: PlantMap,
+    config: MatchConfig | None = None,
+    growth: GrowthConfig | None = None,
+    *,
+    similarity: bool = False,
+) -> Match:
+    """Match a session with a plant that has been moved to the session's time.
+
+    Parameters
+    ----------
+    session
+        What was seen.
+    plant
+        As :func:`cluster_slam.constellation.growth.at` gives it for the session's time.
+    similarity
+        Let the unit of length differ by a factor between ``config.scale_min`` and ``config.scale_max``.
+    """
+    config = config or MatchConfig()
+    alive = _alive(plant)
+    candidates: list[_Candidate] = []
+    repeated = False
+    for space, single in _ways(session, alive):
+        scene = _scene(session, alive, space, config, growth or GrowthConfig(), single=single, similarity=similarity)
+        if scene is None:
+            continue
+        explained, again = _search(scene)
+        repeated |= again
+        pool = [_Candidate(space, scene, e, _evidence(scene, e), single) for e in explained]
+        candidates += pool
+    if not candidates:
+        return Match(plant.name, 0.0, -np.inf, -np.inf, False)
+    best = max(candidates, key=lambda c: c.evidence)
+    others = [c.evidence for c in candidates if _says_something_else(best, c)]
+    name, runner_up = plant.name, max(others, default=-np.inf)
+    found = _found(session, alive, best, similarity)
+    return Match(name, best.found.log_ratio, best.evidence, runner_up, repeated, found)
+
+
+def _alive(plant: PlantMap) -> PlantMap:
+    """Only the flowers that may still be there."""
+    keep = plant.flower_presence > 0.02
+    names = ("ids", "cluster_ids", "first_seen", "last_seen", "last_looked_at", "presence", "covs")
+    values = {f"flower_{name}": getattr(plant, f"flower_{name}")[keep] for name in names}
+    return replace(plant, flowers=plant.flowers[keep], **values)
+
+
+def _ways(session: Constellation, plant: PlantMap) -> list[tuple[Space, bool]]:
+    sigma = (
+        float(np.sqrt(np.trace(session.flower_covs, axis1=1, axis2=2).mean() / 3.0)) if len(session.flowers) else 0.0
+    )
+    found = spaces(session.flowers, plant.flowers, sigma, session.viewpoint, plant.viewpoint)
+    small = max(len(session.flowers), len(plant.flowers)) <= SINGLES_UP_TO
+    return [(space, single) for space in found for single in ([False, True] if small else [False])]
+
+
+def _scene(
+    session: Constellation,
+    plant: PlantMap,
+    space: Space,
+    config: MatchConfig,
+    growth: GrowthConfig,
+    *,
+    single: bool,
+    similarity: bool,
+) -> Scene | None:
+    """Both sides in one space; None where there are too few landmarks for a pose."""
+    points, known = space.session(session.flowers), space.plant(plant.flowers)
+    if min(len(points), len(known)) < space.d:
+        return None
+    groups = [session_units(session, points, single=False), plant_units(plant, known, config, single=False)]
+    gap = session.start - plant.last_session
+    days = 0.0 if np.isnan(gap) else abs(gap) / DAY_S
+    n_new = config.ghosts + growth.new_per_day * days * len(known) / max(len(groups[1]), 1)
+    background = background_of(groups[0], groups[1], config, n_new)
+    scale_range = (config.scale_min, config.scale_max) if similarity else (1.0, 1.0)
+    if not single:
+        if min(len(g) for g in groups) < space.d:
+            return None
+        return Scene(groups[0], groups[1], background, np.zeros(len(groups[0])), config, scale_range)
+    size = groups[0].groups.mask.sum(axis=1)
+    per_flower = (background.log_group_density + (size - 1) * background.log_density) / size
+    query = session_units(session, points, single=True)
+    bonus = per_flower[query.cluster] - background.log_group_density
+    return Scene(query, plant_units(plant, known, config, single=True), background, bonus, config, scale_range)
+
+
+def _places(units: Units, jump: float) -> Places:
+    """Centres with sigmas: drift, the flowers' own errors, and the jump of a centroid of changing flowers."""
+    size = np.maximum(units.groups.mask.sum(axis=1), 1)
+    own = np.where(units.groups.mask, units.groups.variances, 0.0).sum(axis=1) / size**2
+    return Places(units.centres, np.sqrt(units.var_offset + own + jump**2 * (size > 1)))
+
+
+def _search(scene: Scene) -> tuple[list[Explained], bool]:
+    """The best explanations, refined, best first; and whether the layout of centres fits in several ways."""
+    config = scene.config
+    query, known = _places(scene.query, 0.002), _places(scene.known, 0.006)
+    poses = guess_poses(query, known, scene.scale_range, config.n_seeds, config.max_poses)
+    if not len(poses):
+        return [], False
+    scores, counts = quick_scores(poses, query, known, scene.background.log_group_density)
+    spread = float(np.sqrt(((query.centres - query.centres.mean(0)) ** 2).sum(1).mean()))
+    top = best_distinct(poses, scores, query.centres, 0.05 * spread, config.n_kept)
+    n_least = min(len(query.centres), len(known.centres))
+    far = best_distinct(poses.take(top), scores[top], query.centres, 0.3 * spread, 2)
+    repeated = len(far) > 1 and bool((counts[top[far]] >= max(4, REPEATED_SHARE * n_least)).all())
+    found = sorted(explain(scene, poses.take(top)), key=lambda e: -e.log_ratio)
+    refined = [refine(scene, e) for e in found[:N_REFINED]]
+    return sorted(refined, key=lambda e: -e.log_ratio), repeated
+
+
+def _evidence(scene: Scene, found: Explained) -> float:
+    """Log likelihood ratio with the pose integrated out (Laplace): the peak times its volume over the prior's.
+
+    The prior is uniform over all turns and over places where the session overlaps the plant.
+    """
+    d = scene.query.centres.shape[1]
+    if len(found) < d:
+        return -np.inf
+    pairs = _in_three(matched_pairs(scene, found))
+    with_scale = scene.scale_range[0] < scene.scale_range[1]
+    cov = pose_covariance(pairs, float(found.pose.scale[0]), with_scale=with_scale)
+    keep = [0, 1, 2, 3, 4, 5] if d == 3 else [2, 3, 4]
+    _, log_det = np.linalg.slogdet(cov[np.ix_(keep, keep)])
+    turns = np.log(8 * np.pi**2) if d == 3 else np.log(2 * np.pi)
+    volume = 0.5 * len(keep) * np.log(2 * np.pi) + 0.5 * log_det
+    occam = volume - turns - log_volume(scene.known.centres)
+    if with_scale:  # how sharply the scale is known against its range
+        size = np.sqrt(((pairs.a - pairs.a.mean(0)) ** 2).sum() * len(pairs.a) / max(pairs.n_units, 1) / len(pairs.a))
+        sigma = np.sqrt(float(np.median(pairs.var_offset + pairs.variance.mean())) / max(pairs.n_units, 1)) / size
+        occam += min(0.0, np.log(2.5 * sigma / (scene.scale_range[1] - scene.scale_range[0])))
+    return float(found.log_ratio + min(occam, 0.0))
+
+
+def _in_three(pairs: Pairs) -> Pairs:
+    """Pairs of a plane as pairs in three dimensions."""
+    if pairs.a.shape[1] == 3:
+        return pairs
+    zero = np.zeros((len(pairs.a), 1))
+    return replace(pairs, a=np.hstack([pairs.a, zero]), b=np.hstack([pairs.b, zero]))
+
+
+def _says_something_else(best: _Candidate, other: _Candidate) -> bool:
+    """Whether another explanation gives most flowers other partners."""
+    mine, theirs = (_flower_pairs(c) for c in (best, other))
+    return len(mine & theirs) < 0.5 * max(min(len(mine), len(theirs)), 1)
+
+
+def _flower_pairs(candidate: _Candidate) -> set[tuple[int, int]]:
+    found, scene = candidate.found, candidate.scene
+    row, member = np.nonzero(found.partner >= 0)
+    a = scene.query.flower[found.query[row], member]
+    b = scene.known.flower[found.known[row], found.partner[row, member]]
+    return set(zip(a.tolist(), b.tolist(), strict=True))
+
+
+def _found(session: Constellation, alive: PlantMap, best: _Candidate, similarity: bool) -> Found | None:
+    scene, found = best.scene, best.found
+    if best.single:
+        scene, found = warped(scene, found)
+    if len(found) < best.space.d:
+        return None
+    pose, scale = found.pose, float(found.pose.scale[0])
+    row, member = np.nonzero(found.partner >= 0)
+    a = session.flowers[scene.query.flower[found.query[row], member]]
+    pairs = replace(matched_pairs(scene, found), a=a, b=a)
+    cov = pose_covariance(pairs, scale, with_scale=similarity)
+    return Found(
+        alive, best.space.to_map(pose.R[0], pose.t[0], scale), scale, cov, best.space, scene, found, best.single
+    )

@@ -1,0 +1,154 @@
+"""Guesses of the pose from nothing: triples (in the plane: pairs) of landmarks whose distances agree.
+
+All agreeing triples of the map are found for each of some spread triples of the session; nothing is drawn at random,
+so a pose that is there is found. Then a quick score, and the best poses that differ.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from cluster_slam.constellation.similarity import Similarities, align, concatenate
+from cluster_slam.geometry import Array
+from cluster_slam.records import BoolArray, IntArray
+
+TOLERANCE = 2.2  # sigmas of a side's difference
+_HEADS = 400_000  # pairs that are joined at once at most
+_BEGINNINGS = 60  # landmarks of the session that are combined to triples at most
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Places:
+    """Landmarks by their centres."""
+
+    centres: Array  # (n, d)
+    sigma: Array  # (n,) of a centre along each axis, m
+
+
+def guess_poses(
+    query: Places, known: Places, scale_range: tuple[float, float], n_seeds: int, max_poses: int
+) -> Similarities:
+    """Poses query -> known (h) from agreeing triples, or pairs where d = 2; at most ``max_poses``, evenly taken."""
+    d = query.centres.shape[1]
+    D = np.linalg.norm(known.centres[:, None] - known.centres, axis=2)
+    parts = []
+    for corner in _corners(query.centres, n_seeds, d):
+        found = _agreeing(query, known, D, corner, scale_range)
+        if len(found):
+            a = np.broadcast_to(query.centres[corner], (len(found), d, d))
+            parts.append(align(a, known.centres[found], scale_range))
+    if not parts:
+        return align(np.zeros((0, d, d)), np.zeros((0, d, d)), scale_range)
+    poses = concatenate(parts)
+    if len(poses) > max_poses:
+        poses = poses.take(np.linspace(0, len(poses) - 1, max_poses).astype(np.int64))
+    return poses
+
+
+def _corners(centres: Array, n_seeds: int, d: int) -> IntArray:
+    """Well-shaped triples (pairs) of rows (s, d): large area over longest side, each row used evenly."""
+    n = len(centres)
+    chosen = np.unique(np.linspace(0, n - 1, min(n, _BEGINNINGS)).round().astype(np.int64))
+    D = np.linalg.norm(centres[:, None] - centres, axis=2)
+    i, j = np.triu_indices(len(chosen), 1)
+    if d == 2:
+        corners, worth = chosen[np.stack([i, j], axis=1)], D[chosen[i], chosen[j]]
+    else:
+        a, b, c = (chosen[x] for x in _triples(len(chosen)))
+        longest = np.maximum(np.maximum(D[a, b], D[b, c]), D[a, c])
+        area = np.linalg.norm(np.cross(centres[b] - centres[a], centres[c] - centres[a]), axis=1)
+        corners, worth = np.stack([a, b, c], axis=1), area / np.maximum(longest, 1e-9)
+    reach = np.median(D[D > 0]) if (D > 0).any() else 1.0
+    worth = np.minimum(worth, 0.8 * reach)  # sides that reach across are good enough; farther ones drift apart more
+    return _evenly(corners, worth, n, n_seeds)
+
+
+def _triples(n: int) -> tuple[IntArray, IntArray, IntArray]:
+    i, j, k = np.meshgrid(*[np.arange(n)] * 3, indexing="ij")
+    keep = (i < j) & (j < k)
+    return i[keep], j[keep], k[keep]
+
+
+def _evenly(corners: IntArray, worth: Array, n: int, n_seeds: int) -> IntArray:
+    """The worthiest corners, such that no row is used much more often than the others."""
+    order = np.argsort(-worth, kind="stable")
+    limit = int(np.ceil(1.5 * corners.shape[1] * n_seeds / max(n, 1))) + 1
+    used = np.zeros(n, dtype=np.int64)
+    kept = []
+    for k in order[: 60 * n_seeds].tolist():
+        if (used[corners[k]] < limit).all():
+            used[corners[k]] += 1
+            kept.append(k)
+            if len(kept) == n_seeds:
+                break
+    return corners[kept]
+
+
+def _agreeing(query: Places, known: Places, D: Array, corner: IntArray, scale_range: tuple[float, float]) -> IntArray:
+    """Ordered triples (pairs) of known rows (k, d) whose sides, of the distances D (m, m), agree with the corner's."""
+    pairs = _side(query, known, D, corner[0], corner[1], scale_range)
+    if len(corner) == 2:
+        return np.stack(np.nonzero(pairs), axis=1)
+    second = _side(query, known, D, corner[1], corner[2], scale_range)
+    third = _side(query, known, D, corner[0], corner[2], scale_range)
+    i, j = np.nonzero(pairs)
+    i, j = i[:_HEADS], j[:_HEADS]
+    if len(known.centres) <= 64:
+        row, k = np.nonzero(second[j] & third[i])
+        return np.stack([i[row], j[row], k], axis=1)
+    j2, k2 = np.nonzero(second)
+    begin, end = np.searchsorted(j2, j), np.searchsorted(j2, j, side="right")
+    row = np.repeat(np.arange(len(i)), end - begin)
+    step = np.arange(len(row)) - np.repeat(np.cumsum(end - begin) - (end - begin), end - begin)
+    k = k2[begin[row] + step]
+    good = third[i[row], k]
+    agreeing: IntArray = np.stack([i[row], j[row], k], axis=1)[good]
+    return agreeing
+
+
+def _side(query: Places, known: Places, D: Array, a: int, b: int, scale_range: tuple[float, float]) -> BoolArray:
+    """Which pairs of known landmarks (m, m) are as far apart as two of the session."""
+    length = float(np.linalg.norm(query.centres[a] - query.centres[b]))
+    var = known.sigma[:, None] ** 2 + known.sigma**2 + query.sigma[a] ** 2 + query.sigma[b] ** 2
+    slack = TOLERANCE * np.sqrt(var)
+    agrees = (scale_range[0] * length - slack <= D) & (scale_range[1] * length + slack >= D)
+    np.fill_diagonal(agrees, False)
+    return np.asarray(agrees, dtype=bool)
+
+
+def quick_scores(poses: Similarities, query: Places, known: Places, log_density: float) -> tuple[Array, Array]:
+    """How well the centres alone agree (h,): log likelihood of nearest, one-to-one, over the background's density.
+
+    Also the number of the session's landmarks (h,) that find one of the map.
+    """
+    h, n, d = len(poses), len(query.centres), query.centres.shape[1]
+    moved = poses.apply(query.centres)
+    tree = cKDTree(known.centres)
+    found = tree.query(moved.reshape(-1, d))
+    distance, nearest = np.asarray(found[0]).reshape(h, n), np.asarray(found[1]).reshape(h, n)
+    var = (1.4**2) * (known.sigma[nearest] ** 2 + query.sigma**2)
+    gain = -0.5 * distance**2 / var - 0.5 * d * np.log(2 * np.pi * var) - log_density
+    gain = np.maximum(gain, 0.0)
+    best = np.zeros((h, len(known.centres)))
+    np.maximum.at(best, (np.arange(h)[:, None], nearest), gain)
+    return best.sum(axis=1), (best > 0).sum(axis=1).astype(float)
+
+
+def best_distinct(poses: Similarities, scores: Array, centres: Array, apart: float, n: int) -> IntArray:
+    """The n best poses (rows, best first) that move the centres by more than ``apart`` (RMS) from each better one."""
+    left = np.argsort(-scores, kind="stable")[: 50 * n]
+    moved = poses.take(left).apply(centres)
+    kept: list[int] = []
+    alive = np.ones(len(left), dtype=bool)
+    for k in range(len(left)):
+        if not alive[k]:
+            continue
+        kept.append(int(left[k]))
+        if len(kept) == n:
+            break
+        near = np.sqrt(((moved[k:] - moved[k]) ** 2).sum(-1).mean(-1)) < apart
+        alive[k:] &= ~near
+    return np.array(kept, dtype=np.int64)

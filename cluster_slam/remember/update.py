@@ -1,0 +1,282 @@
+"""What a session changes in a plant: drift and growth learned, flowers moved, new ones, and who may be gone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from cluster_slam.config import GrowthConfig, MapConfig
+from cluster_slam.constellation.growth import DAY_S, at, gaps
+from cluster_slam.constellation.identify import Identities
+from cluster_slam.geometry import Array, rotate_cov, transform
+from cluster_slam.records import BoolArray, Constellation, IntArray, PlantMap
+from tracking.presence import after_group_miss, after_miss, any_present, persisted
+
+_CLUSTER = (
+    *("cluster_ids", "clusters", "cluster_covs", "cluster_time", "velocities", "velocity_covs"),
+    *("position_velocity_covs", "growth_rates", "growth_vars", "n_flowers", "descriptors", "descriptor_covs"),
+    *("cluster_first_seen", "cluster_last_seen", "cluster_last_looked_at", "cluster_presence"),
+)
+_FLOWER = (
+    *("flower_ids", "flower_cluster_ids", "flowers", "flower_covs", "flower_first_seen", "flower_last_seen"),
+    *("flower_last_looked_at", "flower_presence"),
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Aligned:
+    """A session's flowers in the map, and the transform that took them there."""
+
+    T_map_world: Array  # (4, 4)
+    scale: float
+    flowers: Array  # (f, 3) map
+    covs: Array  # (f, 3, 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Updated:
+    """A plant after a session, and what the session's clusters and flowers are called in it."""
+
+    plant: PlantMap
+    cluster_map_ids: IntArray  # (c,) of the session's clusters
+    flower_map_ids: IntArray  # (f,)
+    missed: IntArray  # cluster ids that were looked at and not seen
+
+
+def aligned(session: Constellation, T_map_world: Array, scale: float) -> Aligned:
+    """The session's flowers moved into the map."""
+    R = T_map_world[:3, :3]
+    covs = scale**2 * rotate_cov(R, session.flower_covs)
+    return Aligned(T_map_world, scale, transform(T_map_world, scale * session.flowers), covs)
+
+
+def empty_plant(name: str, config: GrowthConfig) -> PlantMap:
+    """A plant that nobody has seen yet."""
+    none = {n: np.zeros((0, 3)) for n in ("clusters", "velocities", "flowers")}
+    none |= {n: np.zeros((0, 3, 3)) for n in _CLUSTER + _FLOWER if n.endswith("_covs")}
+    none |= {"descriptors": np.zeros((0, 2)), "descriptor_covs": np.zeros((0, 2, 2))}
+    ids = {n: np.zeros(0, dtype=np.int64) for n in (*_CLUSTER, *_FLOWER) if n.endswith("_ids") or n == "n_flowers"}
+    rest = {n: np.zeros(0) for n in (*_CLUSTER, *_FLOWER) if n not in none and n not in ids}
+    values: dict[str, Any] = {**none, **ids, **rest}
+    return PlantMap(name=name, drift_rate=config.drift_m_per_day, **values)
+
+
+def update(
+    plant: PlantMap,
+    session: Constellation,
+    where: Aligned,
+    who: Identities,
+    looked: BoolArray,
+    config: MapConfig,
+    next_cluster: int,
+    next_flower: int,
+) -> Updated:
+    """The plant after a session.
+
+    Parameters
+    ----------
+    plant
+        As the map holds it, not moved.
+    who
+        Rows of ``plant`` for the session's clusters and flowers.
+    looked
+        (g,) which of the plant's flowers the session looked at.
+    next_cluster, next_flower
+        The first free ids.
+    """
+    now = session.end if np.isnan(session.start) else session.start
+    moved = at(plant, now, config.growth)
+    kept = _Work(plant, moved, session, where, who, config, now)
+    kept.follow_clusters()
+    kept.look(looked)
+    grown, cluster_ids, flower_ids = _with_new(
+        kept.result(), session, where, who, config, now, next_cluster, next_flower
+    )
+    missed = plant.cluster_ids[kept.missed]
+    return Updated(_summarised(grown), cluster_ids, flower_ids, missed)
+
+
+class _Work:
+    """The plant's tables while one session is put in."""
+
+    def __init__(
+        self,
+        plant: PlantMap,
+        moved: PlantMap,
+        session: Constellation,
+        where: Aligned,
+        who: Identities,
+        config: MapConfig,
+        now: float,
+    ) -> None:
+        self.plant, self.moved, self.session, self.where, self.who, self.config, self.now = (
+            *(plant, moved, session, where, who, config, now),
+        )
+        self.values = {name: np.array(getattr(plant, name)) for name in (*_CLUSTER, *_FLOWER)}
+        self.dt = gaps(plant, now)
+        self.row = plant.flower_rows
+        self.partner = np.full(len(plant.flower_ids), -1)  # the session's flower of each of the plant's
+        found = np.flatnonzero(who.flower >= 0)
+        self.partner[who.flower[found]] = found
+        self.seen = np.zeros(len(plant.cluster_ids), dtype=bool)
+        self.missed = np.zeros(len(plant.cluster_ids), dtype=bool)
+
+    def follow_clusters(self) -> None:
+        """Each cluster of which flowers were seen again is moved to where they are, and its drift is learned."""
+        for c in np.unique(self.row[self.partner >= 0]).tolist():
+            members = np.flatnonzero(self.row == c)
+            self.seen[c] = True
+            self._follow(c, members, members[self.partner[members] >= 0])
+
+    def _follow(self, c: int, members: IntArray, found: IntArray) -> None:
+        v, moved = self.values, self.moved
+        theirs = self.partner[found]
+        residual = self.where.flowers[theirs] - moved.flowers[found]
+        own = moved.flower_covs[found] + self.where.covs[theirs]
+        weight = 1.0 / (np.trace(own, axis1=1, axis2=2) / 3.0)
+        mean = weight @ residual / weight.sum()
+        R = np.einsum("k,kij->ij", weight**2, own) / weight.sum() ** 2
+        P = moved.cluster_covs[c]
+        nis = float(mean @ np.linalg.solve(P + R, mean)) / 3.0
+        inflate = max(1.0, nis)  # it moved farther than was thought possible: its drift is less known than was thought
+        P, C, V = (inflate * m for m in (P, moved.position_velocity_covs[c], moved.velocity_covs[c]))
+        S = P + R
+        K = np.linalg.solve(S, P).T
+        Kv = np.linalg.solve(S, C).T
+        offset = K @ mean
+        v["cluster_covs"][c] = _symmetric(P - K @ P)
+        v["velocities"][c] = moved.velocities[c] + Kv @ mean
+        v["velocity_covs"][c] = _symmetric(V - Kv @ C)
+        v["position_velocity_covs"][c] = C - K @ C
+        v["cluster_time"][c] = v["cluster_last_seen"][c] = v["cluster_last_looked_at"][c] = self.now
+        self._grow(c, found, theirs, weight)
+        v["flowers"][members] = moved.flowers[members] + offset
+        v["flower_covs"][members] = moved.flower_covs[members]
+        F, Q = moved.flower_covs[found], self.where.covs[theirs]
+        gain = np.swapaxes(np.linalg.solve(F + Q, F), 1, 2)
+        v["flowers"][found] += (gain @ (residual - offset)[..., None])[..., 0]
+        v["flower_covs"][found] = _symmetric(F - gain @ F)
+
+    def _grow(self, c: int, found: IntArray, theirs: IntArray, weight: Array) -> None:
+        """Learn how fast a cluster's lengths grow from the spread of the flowers that were seen again."""
+        dt = self.dt[c]
+        if len(found) < 3 or dt <= 0:
+            return
+        a, b = self.where.flowers[theirs], self.moved.flowers[found]
+        a, b = a - np.average(a, axis=0, weights=weight), b - np.average(b, axis=0, weights=weight)
+        size = float(weight @ (b * b).sum(1))
+        ratio = max(float(weight @ (a * b).sum(1)) / size, 0.1)
+        var = 1.0 / size / dt**2  # of the rate that the ratio tells
+        prior = self.moved.growth_vars[c]
+        gain = prior / (prior + var)
+        self.values["growth_rates"][c] += gain * np.log(ratio) / dt
+        self.values["growth_vars"][c] = (1.0 - gain) * prior
+
+    def look(self, looked: BoolArray) -> None:
+        """Presence of what was seen, and of what was looked at and not seen."""
+        v, options, growth = self.values, self.config.presence, self.config.growth
+        since = np.nan_to_num((self.now - self.plant.flower_last_looked_at) / DAY_S)
+        prior = persisted(v["flower_presence"], growth.lost_per_day, since)
+        detection = self.config.match.seen_share * (1.0 - options.hidden_share)
+        seen = self.partner >= 0
+        for c in range(len(self.plant.cluster_ids)):
+            members = np.flatnonzero(self.row == c)
+            if self.seen[c]:
+                rest = members[~seen[members]]
+                v["flower_presence"][rest] = after_miss(prior[rest], detection)
+            elif len(members) and looked[members].mean() > 0.5:
+                self.missed[c] = True
+                v["flower_presence"][members] = after_group_miss(
+                    prior[members], detection, options.cluster_hidden_share
+                )
+                v["cluster_last_looked_at"][c] = self.now
+            else:
+                continue
+            v["flower_last_looked_at"][members] = self.now
+        v["flower_presence"][seen] = 1.0
+        v["flower_last_seen"][seen] = self.now
+
+    def result(self) -> PlantMap:
+        """The plant with the tables as they stand."""
+        values: dict[str, Any] = self.values
+        return replace(self.plant, **values)
+
+
+def _symmetric(m: Array) -> Array:
+    out: Array = 0.5 * (m + np.swapaxes(m, -1, -2))
+    return out
+
+
+def _with_new(
+    plant: PlantMap,
+    session: Constellation,
+    where: Aligned,
+    who: Identities,
+    config: MapConfig,
+    now: float,
+    next_cluster: int,
+    next_flower: int,
+) -> tuple[PlantMap, IntArray, IntArray]:
+    """The plant with clusters and flowers that it did not have, and the map's ids of the session's."""
+    growth = config.growth
+    row = np.searchsorted(session.cluster_ids, session.flower_cluster_ids)
+    fresh = np.flatnonzero(who.cluster < 0)
+    cluster_ids = np.where(who.cluster >= 0, 0, -1).astype(np.int64)
+    cluster_ids[who.cluster >= 0] = plant.cluster_ids[who.cluster[who.cluster >= 0]]
+    cluster_ids[fresh] = next_cluster + np.arange(len(fresh))
+    new = np.flatnonzero(who.flower < 0)
+    flower_ids = np.full(len(who.flower), -1, dtype=np.int64)
+    flower_ids[who.flower >= 0] = plant.flower_ids[who.flower[who.flower >= 0]]
+    flower_ids[new] = next_flower + np.arange(len(new))
+    n, k, eye = len(fresh), len(new), np.eye(3)
+    rate_var = (plant.drift_rate / DAY_S) ** 2 / 3.0
+    total = np.zeros((len(cluster_ids), 3))
+    np.add.at(total, row, where.flowers)
+    centroids = total / np.maximum(np.bincount(row, minlength=len(total)), 1)[:, None]
+    more = {
+        "cluster_ids": cluster_ids[fresh],
+        "clusters": centroids[fresh],
+        "cluster_covs": np.tile(1e-8 * eye, (n, 1, 1)),
+        "velocities": np.zeros((n, 3)),
+        "velocity_covs": np.tile(rate_var * eye, (n, 1, 1)),
+        "position_velocity_covs": np.zeros((n, 3, 3)),
+        "growth_rates": np.full(n, growth.size_per_day / DAY_S),
+        "growth_vars": np.full(n, (growth.size_sigma_per_day / DAY_S) ** 2),
+        "n_flowers": np.ones(n, dtype=np.int64),
+        "descriptors": session.descriptors[fresh],
+        "descriptor_covs": session.descriptor_covs[fresh],
+        "flower_ids": flower_ids[new],
+        "flower_cluster_ids": cluster_ids[row[new]],
+        "flowers": where.flowers[new],
+        "flower_covs": where.covs[new],
+    }
+    for name in (*_CLUSTER, *_FLOWER):
+        if name not in more:
+            size = n if name.startswith("cluster") else k
+            more[name] = np.ones(size) if name.endswith("presence") else np.full(size, now)
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(plant, name), more[name]]) for name in (*_CLUSTER, *_FLOWER)
+    }
+    return replace(plant, last_session=np.fmax(plant.last_session, session.end), **joined), cluster_ids, flower_ids
+
+
+def _summarised(plant: PlantMap) -> PlantMap:
+    """The plant with each cluster's centroid, count, descriptor and presence from its flowers."""
+    from cluster_slam.descriptors import inertia_and_mean_distance
+
+    clusters, counts, presence = plant.clusters.copy(), plant.n_flowers.copy(), plant.cluster_presence.copy()
+    descriptors = plant.descriptors.copy()
+    row = plant.flower_rows
+    for c in range(len(clusters)):
+        members = np.flatnonzero(row == c)
+        alive = members[plant.flower_presence[members] > 0.5]
+        counts[c] = len(alive)
+        presence[c] = any_present(plant.flower_presence[members]) if len(members) else 0.0
+        used = alive if len(alive) else members
+        if len(used):
+            clusters[c] = plant.flowers[used].mean(axis=0)
+        if len(alive) >= 2:
+            descriptors[c] = inertia_and_mean_distance(plant.flowers[alive])
+    return replace(plant, clusters=clusters, n_flowers=counts, cluster_presence=presence, descriptors=descriptors)
