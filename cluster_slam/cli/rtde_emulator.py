@@ -63,7 +63,8 @@ def command(
         raise ConfigError(f"unknown series {series!r}, expected {' or '.join(SERIES)}")
     faults = sorted((parse_fault(text) for text in fault or []), key=lambda one: one.at_s)
     played = read_motion(motion, goes_back=loop)
-    emulator = Emulator(Controller(played, uptime_s=uptime), address=bind, port=port, series=series)
+    controller, began = Controller(played, uptime_s=uptime), time.time()
+    emulator = Emulator(controller, address=bind, port=port, series=series)
     emulator.start()
     if not (quiet or as_json):
         sys.stdout.write(f"listening on {bind}:{port}\n")
@@ -72,7 +73,7 @@ def command(
     emulator.close()
     counts = dict(sorted(emulator.counts.items()))
     if as_json:
-        print_json({"address": f"{bind}:{port}", "counts": counts})
+        print_json({"address": f"{bind}:{port}", "began": began, "counts": counts})
     elif not quiet:
         print_table("cluster-slam rtde-emulator", [(name, str(n)) for name, n in counts.items()])
     return 0

@@ -6,6 +6,7 @@ machine's, ``timestamp`` the controller's), ``frames.csv`` has a row for each vi
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Iterable
@@ -85,7 +86,8 @@ class Journal:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         for file in self._files.values():
-            file.close()
+            with contextlib.suppress(OSError):  # the disk is full, and that has been said
+                file.close()
 
     def samples(self, samples: Iterable[RobotSample]) -> None:
         """What the robot said."""

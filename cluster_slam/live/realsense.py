@@ -65,7 +65,7 @@ class RealSenseCamera:
     def _view(self, frames: Any) -> View | None:
         if not (frames.get_color_frame() and frames.get_depth_frame()):
             return None
-        both = self._align.process(frames)
+        both = frames if _share_pixels(frames) else self._align.process(frames)
         colour, depth = both.get_color_frame(), both.get_depth_frame()
         stamp = 1e-3 * float(colour.get_timestamp())
         if stamp == self._last:
@@ -77,6 +77,16 @@ class RealSenseCamera:
         if "rgb8" in str(colour.get_profile().format()):
             image = image[..., ::-1].copy()
         return View(stamp, seen.arrival, seen.points, seen.covs, seen.scores, image, np.array(depth.get_data()))
+
+
+def _share_pixels(frames: Any) -> bool:
+    """Whether depth and colour come from one imager, as a D405's: aligning would only leave holes."""
+    depth = frames.get_depth_frame().get_profile().as_video_stream_profile()
+    colour = frames.get_color_frame().get_profile().as_video_stream_profile()
+    a, b, T = depth.get_intrinsics(), colour.get_intrinsics(), depth.get_extrinsics_to(colour)
+    names = ("width", "height", "fx", "fy", "ppx", "ppy")
+    is_one_camera = all(getattr(a, name) == getattr(b, name) for name in names)
+    return is_one_camera and np.allclose(T.rotation, np.eye(3).ravel(), atol=1e-6) and not np.any(T.translation)
 
 
 def camera_of(intrinsics: Any) -> Camera:

@@ -41,7 +41,7 @@ class PoseAnswer:
 class _Stretch:
     """Samples under one setting of the controller's clock."""
 
-    estimator: ClockEstimator = field(default_factory=ClockEstimator)
+    clock: Clock | None = None  # as last estimated
     stamps: deque[float] = field(default_factory=deque)
     rows: deque[tuple[float, ...]] = field(default_factory=deque)
 
@@ -50,25 +50,25 @@ class RobotPoses:
     """The last half minute of a robot, on this machine's clock."""
 
     def __init__(self) -> None:
+        self._estimator = ClockEstimator()
         self._stretches = [_Stretch()]
         self._last: RobotSample | None = None
 
     @property
     def clock(self) -> Clock | None:
         """The controller's clock against this machine's; None before the first sample."""
-        return self._stretches[-1].estimator.clock
+        return self._estimator.clock
 
     def add(self, samples: Iterable[RobotSample]) -> list[str]:
         """Take samples in; what they show of clocks and tools, in words."""
         told = []
         for sample in samples:
             stretch = self._stretches[-1]
-            if stretch.estimator.add(sample.stamp, sample.arrival):
+            if self._estimator.add(sample.stamp, sample.arrival):
                 told.append(f"the controller's clock was set: {sample.stamp:.3f} after {stretch.stamps[-1]:.3f} s")
-                estimator = ClockEstimator()
-                estimator.add(sample.stamp, sample.arrival)
-                stretch = _Stretch(estimator)
+                stretch = _Stretch()
                 self._stretches = [self._stretches[-1], stretch]
+            stretch.clock = self._estimator.clock
             if self._last is not None and _is_tool_change(self._last, sample):
                 told.append("the pose jumped while the joints stood: was the active TCP changed?")
             self._last = sample
@@ -82,10 +82,9 @@ class RobotPoses:
     def at(self, time: float) -> PoseAnswer:
         """The pose at a time of this machine's clock, s."""
         for stretch in reversed(self._stretches):
-            clock = stretch.estimator.clock
-            if clock is None:
+            if stretch.clock is None:
                 return PoseAnswer(PoseState.NOT_YET)
-            stamp = float(clock.stamp(np.array([time]))[0])
+            stamp = float(stretch.clock.stamp(np.array([time]))[0])
             if stamp >= stretch.stamps[0]:
                 return _between(stretch, stamp, is_last=stretch is self._stretches[-1])
         if len(self._stretches) > 1 and time > self._begin_of_first():
@@ -94,8 +93,7 @@ class RobotPoses:
 
     def _begin_of_first(self) -> float:
         first = self._stretches[0]
-        clock = first.estimator.clock
-        return float("inf") if clock is None else float(clock.arrival(np.array([first.stamps[0]]))[0])
+        return float("inf") if first.clock is None else float(first.clock.arrival(np.array([first.stamps[0]]))[0])
 
 
 def _between(stretch: _Stretch, stamp: float, *, is_last: bool) -> PoseAnswer:

@@ -4,7 +4,8 @@ ur_rtde's constructor can hang for ever with the interpreter's lock held, its ge
 and ``reconnect`` can crash. So the client lives here, alone: it tells its parent on stdout what it reads, an alarm
 ends the process where it hangs, and for the next connection there is a new one. It reads; it never commands.
 
-Run by :class:`cluster_slam.sensors.rtde.link.RobotLink` as ``python -m cluster_slam.sensors.rtde.child HOST RATE``.
+Run by :class:`cluster_slam.sensors.rtde.link.RobotLink` as ``python -m cluster_slam.sensors.rtde.child HOST RATE
+SECONDS``: how long connecting may take.
 """
 
 from __future__ import annotations
@@ -24,19 +25,18 @@ REQUIRED = ("timestamp", "actual_TCP_pose")
 OPTIONAL = ("actual_q", "robot_mode", "safety_status_bits")
 SAMPLE, ALIVE, CONNECTED, REFUSED, LOST = range(5)  # kinds of messages
 SAMPLE_STRUCT = struct.Struct(">dd6d6dii")  # arrival, stamp, pose, joints, robot mode, safety bits
-CONNECT_S = 6.0  # the constructor takes 2.5 s where no data come; longer, and it hangs
 HANG_S = 2.0  # so long for one round of reading
 _ALIVE_S = 0.1  # a sign of life so often
 _PR_SET_PDEATHSIG = 1
 
 
-def main(host: str, rate_hz: float) -> int:
+def main(host: str, rate_hz: float, connect_s: float) -> int:
     """Connect, read until the connection is lost, end."""
     out = os.dup(1)
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)  # the client writes its messages there
     _die_with_parent()
-    signal.setitimer(signal.ITIMER_REAL, CONNECT_S)  # its default action ends the process, lock held or not
+    signal.setitimer(signal.ITIMER_REAL, connect_s)  # its default action ends the process, lock held or not
     try:
         receiver, names = _connect(host, rate_hz)
     except RuntimeError as error:
@@ -113,4 +113,4 @@ def _die_with_parent() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1], float(sys.argv[2])))
+    sys.exit(main(sys.argv[1], float(sys.argv[2]), float(sys.argv[3])))

@@ -18,7 +18,7 @@ from cluster_slam.sensors.rtde.fields import BIT_PROTECTIVE_STOP
 from cluster_slam.sensors.rtde.wire import PackageReader
 
 STALE_S = 0.1  # without a new sample for so long, the robot counts as lost
-_SILENT_S = child.CONNECT_S + 1.0  # the child's own alarm comes first
+CONNECT_S = 6.0  # the client's constructor takes 2.5 s where no data come; longer, and it hangs
 _PAUSES_S = (0.1, 0.2, 0.5, 1.0, 2.0)  # before the next try; the last one for ever
 
 
@@ -59,7 +59,9 @@ class LinkEvent:
 class RobotLink:
     """Samples of a robot. Use it as a context manager; ``take`` never waits."""
 
-    def __init__(self, host: str, *, rate_hz: float = 125.0, max_samples: int = 200_000) -> None:
+    def __init__(
+        self, host: str, *, rate_hz: float = 125.0, connect_s: float = CONNECT_S, max_samples: int = 200_000
+    ) -> None:
         """
         Parameters
         ----------
@@ -67,10 +69,12 @@ class RobotLink:
             Name or address of the controller; the port is RTDE's, 30004.
         rate_hz
             Samples a second to ask for.
+        connect_s
+            After so long a client that has not connected is ended.
         max_samples
             Kept at most between two calls of ``take``; the oldest go first.
         """
-        self.host, self.rate_hz = host, rate_hz
+        self.host, self.rate_hz, self._connect_s = host, rate_hz, connect_s
         self.fields: tuple[str, ...] = ()  # that this controller has
         self._samples: deque[RobotSample] = deque(maxlen=max_samples)
         self._events: deque[LinkEvent] = deque(maxlen=10_000)
@@ -128,7 +132,8 @@ class RobotLink:
 
     def _one_life(self) -> None:
         self._n_failures += 1
-        command = [sys.executable, "-m", "cluster_slam.sensors.rtde.child", self.host, str(self.rate_hz)]
+        numbers = [str(self.rate_hz), str(self._connect_s)]
+        command = [sys.executable, "-m", "cluster_slam.sensors.rtde.child", self.host, *numbers]
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, bufsize=0
         )
@@ -151,7 +156,7 @@ class RobotLink:
         why, heard = "the client hung or crashed", time.monotonic()
         while self._is_open:
             if not select.select([pipe], [], [], 0.1)[0]:
-                if time.monotonic() - heard > _SILENT_S:
+                if time.monotonic() - heard > self._connect_s + 1.0:  # its own alarm comes first
                     return "the client is silent"
                 continue
             data = os.read(pipe, 65536)
