@@ -47,7 +47,9 @@ class TemplateConfig:
     jump_speed: float = 0.25  # m/s, one sigma of the velocity after a jump
     match_gain: float = 7.0  # log-likelihood of a match over that of clutter, at distance zero
     min_score: float = 6.0  # of an accepted hypothesis
-    forget_frames: int = 40  # unseen for so long: back to rest
+    forget_s: float = 1.3  # unseen for so long: back to rest
+    lost_s: float = 0.17  # unseen for so long: it may have jumped
+    sway_share: float = 0.02  # of the time in which a cluster is off its rest when it comes into view, before the data
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,13 +111,13 @@ class GrowthConfig:
     """How plants change over days. Priors: what sessions show corrects them."""
 
     drift_m_per_day: float = 0.003  # RMS norm of a cluster's drift; wrong by a factor of two is covered
-    common_share: float = 0.25  # of it: what all clusters share, which no alignment can see
     walk_m_per_sqrt_day: float = 0.0007  # random walk of a cluster, one sigma an axis
     flower_walk_m_per_sqrt_day: float = 0.0005  # of a flower within its cluster
     setting_m: float = 0.0005  # one sigma an axis: how a cluster hangs another time, even on the same day
     flower_setting_m: float = 0.0005  # the same of a flower within its cluster
     size_per_day: float = 0.01  # relative growth of all lengths within a cluster
-    size_sigma_per_day: float = 0.01  # of that rate, one sigma
+    size_sigma_per_day: float = 0.01  # of that rate, one sigma, in common to all clusters until it has been learned ...
+    size_spread: float = 0.3  # ... and this share of it from cluster to cluster
     lost_per_day: float = 0.02  # share of the flowers
     new_per_day: float = 0.03  # share of the flowers
 
@@ -168,7 +170,8 @@ class LocaliseConfig:
     n_triples: int = 24  # of a frame's points, from which poses are guessed: at most
     n_triples_sure: int = 6  # after which a pose that explains a sure share of the points ends the search
     sure_share: float = 0.6  # of the points
-    n_refined: int = 12  # guesses that are refined with all that is known
+    n_guesses: int = 40  # of each triple; four times as many where nothing is sure yet
+    n_refined: int = 12  # guesses that are refined with all that is known; five times as many where nothing is sure
     sway_m: float = 0.002  # of a cluster from rest, one sigma an axis, before the session has shown its own
     detection: float = 0.8  # probability that a flower in view is detected
     unmapped: float = 0.2  # share of the points that the map does not have: false ones, new flowers

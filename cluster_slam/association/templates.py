@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cluster_slam.association.frames import Frames, field_of_view, information, point_jacobian
+from cluster_slam.association.frames import Frames, chi2_and_log_det, field_of_view, information, point_jacobian
 from cluster_slam.association.tracklets import match, solve_pose_correction
 from cluster_slam.config import TemplateConfig
 from cluster_slam.geometry import Array, inverse, rotate_cov, se3_exp, transform
@@ -30,6 +30,9 @@ class Followed:
     correction: Array  # (n, 6) pose corrections
 
 
+REST_SIGMA_M = 0.001  # how far a cluster at rest may be from it
+
+
 class _Springs:
     """Displacement and velocity of all clusters, (c, 6) with (c, 6, 6)."""
 
@@ -37,17 +40,18 @@ class _Springs:
         self.config = config
         self.x = np.zeros((n, 6))
         self.P = np.zeros((n, 6, 6))
-        self.unseen = np.zeros(n, dtype=np.int64)
+        self.unseen_s = np.zeros(n)
         self.reset(np.ones(n, dtype=bool))
 
     def reset(self, which: BoolArray) -> None:
         c = self.config
         self.x[which] = 0.0
-        sigma = np.repeat([0.001, 0.001 * 2 * np.pi * c.sway_hz], 3)
+        sigma = np.repeat([REST_SIGMA_M, REST_SIGMA_M * 2 * np.pi * c.sway_hz], 3)
         self.P[which] = np.diag(sigma**2)
 
     def predict(self, dt: float) -> None:
         c = self.config
+        self.unseen_s += dt
         omega = 2 * np.pi * c.sway_hz
         cos, sin = np.cos(omega * dt), np.sin(omega * dt)
         F = np.kron(np.array([[cos, sin / omega], [-omega * sin, cos]]), np.eye(3))
@@ -80,10 +84,21 @@ class Follower:
     """Follows clusters with known rest places through a session (one direction)."""
 
     def __init__(
-        self, frames: Frames, T: Array, cov_pose: Array, places: Array, cluster: IntArray, config: TemplateConfig
+        self,
+        frames: Frames,
+        T: Array,
+        cov_pose: Array,
+        places: Array,
+        cluster: IntArray,
+        clutter_density: float,
+        config: TemplateConfig,
     ) -> None:
-        """Camera poses T (n, 4, 4) with (n, 6, 6), rest places (l, 3) and the cluster 0..c-1 (l,) of each."""
+        """Camera poses T (n, 4, 4) with (n, 6, 6), rest places (l, 3) and the cluster 0..c-1 (l,) of each.
+
+        ``clutter_density``: false detections a frame and m^3.
+        """
         self.frames, self.T, self.config = frames, T, config
+        self.log_clutter = float(np.log(clutter_density))
         self.places, self.cluster = places, cluster
         self.n_clusters = int(cluster.max(initial=-1)) + 1
         self.cov_pose = cov_pose
@@ -124,10 +139,29 @@ class Follower:
             self.correction[i] = z
             w = transform(self.T[i] @ se3_exp(z), c)
         rows, cols, chi2 = match(predicted, P, w, S, cfg.gate_chi2)
-        rows, cols, chi2 = self._search(i, flowers, rows, cols, chi2, w, S)
+        sure = self._is_likely(flowers[rows], w[cols], S[cols], P[rows], chi2)
+        rows, cols, chi2 = self._search(i, flowers, rows[sure], cols[sure], chi2[sure], w, S)
         self._absorb(i, flowers[rows], cols, w, S)
         self.landmark[here.start + cols] = flowers[rows]
         self.chi2[here.start + cols] = chi2
+
+    def _is_likely(self, flowers: IntArray, w: Array, S: Array, P: Array, chi2: Array) -> BoolArray:
+        """Which matches (q,) are likelier than a false detection: a single flower that was lost proves little.
+
+        Where it stands at rest it is believed. Off its rest, the prediction of a spring that was not seen for some time
+        is so wide that any false detection fits it.
+        """
+        s, cfg = self.springs, self.config
+        owner = self.cluster[flowers]
+        offset = w - self.places[flowers]
+        rest, _ = chi2_and_log_det(offset, S + REST_SIGMA_M**2 * np.eye(3))
+        _, log_det = chi2_and_log_det(offset, S + P)
+        log_prior = np.where(s.unseen_s[owner] < cfg.lost_s, 0.0, np.log(cfg.sway_share))
+        ratio = log_prior - 0.5 * (chi2 + log_det + 3.0 * np.log(2.0 * np.pi)) - self.log_clutter
+        alone = np.bincount(owner, minlength=self.n_clusters)[owner] < 2
+        reached = (offset * offset).sum(-1) < cfg.reach_unseen_m**2
+        likely: BoolArray = (~alone | (rest < cfg.gate_chi2) | (ratio > 0.0)) & reached
+        return likely
 
     def _in_view(self, i: int) -> BoolArray:
         p = transform(inverse(self.T[i]), self.places + self.springs.x[self.cluster, :3])
@@ -149,9 +183,8 @@ class Follower:
         seen = np.unique(owner)
         cov = information(total[seen])
         s.update(seen, (cov @ moment[seen][..., None])[..., 0], cov)
-        s.unseen += 1
-        s.unseen[seen] = 0
-        lost = s.unseen > cfg.forget_frames
+        s.unseen_s[seen] = 0.0
+        lost = s.unseen_s > cfg.forget_s
         if lost.any():
             s.reset(lost)
         residual = w[cols] - self.places[flowers] - s.x[owner, :3]
@@ -214,7 +247,7 @@ class Follower:
         cfg, s = self.config, self.springs
         mine = np.flatnonzero(owner == j)
         L = self.places[flowers[mine]]
-        reach = cfg.reach_m if s.unseen[j] < 5 else cfg.reach_unseen_m
+        reach = cfg.reach_m if s.unseen_s[j] < cfg.lost_s else cfg.reach_unseen_m
         pool = np.flatnonzero(free)
         step = w[pool][None] - L[:, None]
         near = (step * step).sum(-1) < reach * reach
@@ -224,7 +257,7 @@ class Follower:
         pool, step, near = pool[used], step[:, used], near[:, used]
         points, W = w[pool], information(S[pool] + cfg.landmark_sigma_m**2 * np.eye(3))
         d = np.concatenate([step[near], s.x[j : j + 1, :3], np.zeros((1, 3))])
-        prior = _JumpPrior(s.x[j, :3], s.P[j, :3, :3], cfg.jump_sigma_m * (1.0 if s.unseen[j] < 5 else 2.0))
+        prior = _JumpPrior(s.x[j, :3], s.P[j, :3, :3], cfg.jump_sigma_m * (1.0 if s.unseen_s[j] < cfg.lost_s else 2.0))
         gain = _gains(d, L, points, 0.5 * W, cfg.match_gain)
         total = gain.max(axis=2).sum(axis=1) + prior(d)
         best = _NOTHING
@@ -252,7 +285,7 @@ class Follower:
         chi2 = np.einsum("qi,qij,qj->q", residual, W[cols], residual)
         log_prior = float(prior(d[None])[0])
         score = np.maximum(gain_at_zero - 0.5 * chi2, 0.0).sum() - (len(L) - len(rows)) + log_prior
-        is_jump = log_prior < -6.0 or self.springs.unseen[j] > 0
+        is_jump = log_prior < -6.0 or self.springs.unseen_s[j] > 0
         return _Hypothesis(float(score), mine[rows], pool[cols], chi2, d, np.linalg.inv(total), is_jump)
 
 

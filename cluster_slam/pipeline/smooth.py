@@ -16,7 +16,15 @@ from cluster_slam.graph.variance import displacement_correlation
 from cluster_slam.records import Result, Session
 from cluster_slam.smoothing.finish import make_result
 from cluster_slam.smoothing.first import first_world
-from cluster_slam.smoothing.rounds import associate, drop_unsupported, mend, observations_err_slowly, regroup, solve
+from cluster_slam.smoothing.rounds import (
+    associate,
+    drop_unsupported,
+    mend,
+    observations_err_slowly,
+    regroup,
+    settle,
+    solve,
+)
 from cluster_slam.smoothing.world import World, for_solving, learn, with_variances
 
 Progress = Callable[[str, float], None]
@@ -53,12 +61,16 @@ def smooth(
     if world.cov_step is None:
         world = drop_unsupported(stated, world, config)
     say("smoothing all", 0.85)
-    for n_iterations in (4, 2):
-        frames, model = for_solving(stated, stated_poses, world)
-        smoother, estimate = solve(frames, model, world, config, n_iterations)
-        known, world = world.noise, learn(world, smoother, estimate)
-        if abs(np.log(world.noise.flower / known.flower)) + abs(np.log(world.noise.pose / known.pose)) < 0.1:
-            break
+    frames, model = for_solving(stated, stated_poses, world)
+    smoother, estimate = solve(frames, model, world, config, 4)
+    if world.cov_step is None and not world.errs_slowly:
+        world = settle(frames, world, smoother, estimate)
+    world = learn(world, smoother, estimate)
+    if world.cov_step is None:
+        world = regroup(frames, world, config, rng)
+    frames, model = for_solving(stated, stated_poses, world)
+    smoother, estimate = solve(frames, model, world, config, 2)
+    world = learn(world, smoother, estimate)
     if world.errs_slowly:  # all observations of a flower say the same: its place is as uncertain as one of them
         smoother.correlation = float(np.bincount(smoother.landmark, minlength=1).max())
     smoother.pairs = replace(

@@ -136,6 +136,7 @@ def estimated_noise(session: Session, frames: Frames, world: World, smoother: Ba
     if session.pose_error == "absolute":
         found["pose_translation"] = stated.pose_translation * float(np.sqrt(noise.pose))
         found["pose_rotation"] = stated.pose_rotation * float(np.sqrt(noise.pose))
+    found["wild_share"] = world.wild_share
     found["flower_factor"] = float(np.sqrt(noise.flower))
     found["pose_factor"] = float(np.sqrt(noise.pose))
     if len(smoother.pairs.sigma):

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from cluster_slam.association.alone import without_support
+from cluster_slam.association.claim import claim_wild, let_go
 from cluster_slam.association.displacement import (
     cluster_pairs,
     measured_displacements,
@@ -15,7 +17,7 @@ from cluster_slam.association.displacement import (
 from cluster_slam.association.frames import Frames, view_volume
 from cluster_slam.association.landmarks import group_means
 from cluster_slam.association.refine import compact, find_overlooked, merge_ghosts, supported
-from cluster_slam.association.templates import Follower, combine_directions
+from cluster_slam.association.templates import REST_SIGMA_M, Follower, combine_directions
 from cluster_slam.config import SmoothConfig
 from cluster_slam.geometry import transform
 from cluster_slam.graph.batch import BatchSmoother, Estimate, Pairs, PoseModel
@@ -25,6 +27,7 @@ from cluster_slam.grouping import Motion, group_flowers
 from cluster_slam.smoothing.world import NO_WEIGHT, World, fewest_observations, scalar_var
 from tracking.gating import chi2_threshold
 
+LEAST_WILD = 0.001  # share of wild errors that is always reckoned with
 _REST_SIGMA_M = 0.0004  # ambient sway of a cluster at rest
 
 
@@ -32,13 +35,19 @@ def associate(frames: Frames, model: PoseModel, world: World, config: SmoothConf
     """Follow the clusters forwards and backwards; each frame of each cluster takes the better of the two."""
     cov, _ = camera_covs(model, world.X)
     cov_pose = np.tile(cov, (frames.n_frames, 1, 1))
-    forward = Follower(frames, world.T, cov_pose, world.places, world.cluster, config.follow).run()
+    false = max(int((world.landmark < 0).sum()), 1) / max(frames.n_frames, 1) / view_volume(frames)
+    forward = Follower(frames, world.T, cov_pose, world.places, world.cluster, false, config.follow).run()
     back = frames.reversed()
-    backward = Follower(back, world.T[::-1], cov_pose, world.places, world.cluster, config.follow).run()
+    backward = Follower(back, world.T[::-1], cov_pose, world.places, world.cluster, false, config.follow).run()
     landmark = np.empty(len(frames), dtype=np.int64)
     landmark[back.order] = backward.landmark
     backward = replace(backward, landmark=landmark, score=backward.score[::-1])
     landmark = combine_directions(forward, backward, frames, world.cluster)
+    agree = forward.landmark == backward.landmark
+    alone = without_support(
+        frames, world.T, world.places, world.cluster, landmark, agree, REST_SIGMA_M, config.follow.gate_chi2
+    )
+    landmark = np.where(alone, -1, landmark)
     keep = np.bincount(landmark[landmark >= 0], minlength=len(world.places)) > 0
     _, cluster = np.unique(world.cluster[keep], return_inverse=True)
     return replace(world, landmark=compact(keep, landmark), places=world.places[keep], cluster=cluster)
@@ -103,8 +112,23 @@ def regroup(frames: Frames, world: World, config: SmoothConfig, rng: np.random.G
     var[at] = np.trace(frames.covs[used], axis1=1, axis2=2) / 3.0
     return replace(
         world,
-        cluster=group_flowers(world.places, presence, Motion(u, var), view_volume(frames), config.grouping, rng=rng),
+        cluster=group_flowers(
+            world.places, presence, Motion(u, var, frames.stamps), view_volume(frames), config.grouping, rng=rng
+        ),
     )
+
+
+def settle(frames: Frames, world: World, smoother: BatchSmoother, estimate: Estimate) -> World:
+    """Claim wild observations for their flowers, and let go what no flower explains."""
+    n_clusters = int(world.cluster.max(initial=-1)) + 1
+    pairs = smoother.pairs
+    moved = np.zeros((frames.n_frames, n_clusters, 3))
+    known = np.zeros((frames.n_frames, n_clusters), dtype=bool)
+    moved[pairs.frame, pairs.cluster] = estimate.d
+    known[pairs.frame, pairs.cluster] = True
+    landmark, wild = claim_wild(frames, estimate.T, estimate.places, world.cluster, world.landmark, moved, known)
+    landmark = let_go(landmark, estimate.residual_chi2, frames, wild, LEAST_WILD)
+    return replace(world, landmark=landmark, wild_share=wild.share)
 
 
 def drop_unsupported(frames: Frames, world: World, config: SmoothConfig) -> World:

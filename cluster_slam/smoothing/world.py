@@ -29,6 +29,7 @@ class World:
     noise: VarianceFactors  # what was found about the stated variances so far
     held: Array  # (6, 6) projector on what of the hand-eye tangent the session cannot tell
     cov_step: Array | None = None  # (n - 1, 6, 6) of odometry, where following its drift has told more than is stated
+    wild_share: float = 0.0  # of observations whose errors are several times what the others' are
     errs_slowly: bool = False  # errors of observations cannot be told from drift of the poses
 
 

@@ -1,0 +1,129 @@
+"""What flowers' motion says of whether they belong together: members of one cluster move as one.
+
+For two flowers the ratio
+
+    r = sum w (|u_f - u_g|^2 - noise) / sum w (|u_f|^2 + |u_g|^2 - noise)
+
+is zero where they move as one and one where they move apart from each other; neighbouring clusters that one touch
+shook lie between. Frames in which the plant moves weigh most; how much it moved is read off the neighbouring frames,
+so that a frame's own noise does not choose it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
+
+from cluster_slam.geometry import Array
+from cluster_slam.records import BoolArray
+
+_WINDOW_S = 0.4  # motion hardly changes for so long
+_SIGNIFICANT = 11.3  # chi-square, 3 degrees of freedom, 99 %
+_FEWEST_FRAMES = 5
+_SURE = 0.33  # motion of three times its own standard deviation is there at all
+_APART = (0.95, 0.35)  # ratio of flowers of two clusters, mean and sigma ...
+_ANYTHING = 0.05  # ... and this share of all pairs has any ratio
+_RANGE = 1.4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """Displacements ``u`` (n, l, 3) from rest, NaN where unseen, their noise ``var`` (n, l), and ``stamps`` (n,) s."""
+
+    u: Array
+    var: Array
+    stamps: Array
+
+
+def motion_evidence(places: Array, motion: Motion, reach: float) -> csr_matrix:
+    """Log-likelihood ratios (l, l) that two flowers within ``reach`` move as one, against that they do not."""
+    pairs = cKDTree(places).query_pairs(reach, output_type="ndarray")
+    n = len(places)
+    if len(pairs) == 0:
+        return csr_matrix((n, n))
+    ratio, sigma = _ratios(pairs, motion)
+    known = sigma < _SURE
+    pairs, ratio, sigma = pairs[known], ratio[known], sigma[known]
+    if len(pairs) == 0:
+        return csr_matrix((n, n))
+    near = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
+    evidence = log_likelihood_ratio(ratio, sigma, _turning(ratio, sigma, near))
+    upper = csr_matrix((evidence, (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    return csr_matrix(upper + upper.T)
+
+
+def log_likelihood_ratio(ratio: Array, sigma: Array, turning: float) -> Array:
+    """Of ratios with standard deviations ``sigma``; ``turning`` is the usual ratio within a cluster that turns."""
+    together = _normal(ratio, 0.5 * turning, np.hypot(sigma, 0.02 + turning))
+    apart = _normal(ratio, _APART[0], np.hypot(sigma, _APART[1]))
+    anything = np.where(np.abs(ratio) < _RANGE, 1.0, 0.0) / (2.0 * _RANGE) + _normal(ratio, 0.5, 0.5 * _RANGE + sigma)
+    anything = 0.5 * anything
+    value: Array = np.log(
+        ((1.0 - _ANYTHING) * together + _ANYTHING * anything) / ((1.0 - _ANYTHING) * apart + _ANYTHING * anything)
+    )
+    return value
+
+
+def _turning(ratio: Array, sigma: Array, distance: Array) -> float:
+    """Usual ratio of the nearest pairs, mostly of one cluster: clusters that turn as they sway are not rigid."""
+    sure = sigma < 0.1
+    if sure.sum() < 10:
+        return 0.0
+    nearest = sure & (distance <= np.quantile(distance[sure], 0.1))
+    return float(np.clip(np.median(ratio[nearest]), 0.0, 0.2))
+
+
+def _normal(x: Array, mean: float, sigma: Array) -> Array:
+    value: Array = np.exp(-0.5 * ((x - mean) / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
+    return value
+
+
+def _ratios(pairs: NDArray[Any], motion: Motion) -> tuple[Array, Array]:
+    """Ratios (p,) of pairs (p, 2) with standard deviations (p,); NaN where too little moved."""
+    seen = np.isfinite(motion.var)
+    power = _power(motion, seen)
+    ratio, sigma = np.full((2, len(pairs)), np.nan)
+    for i, (f, g) in enumerate(pairs.tolist()):
+        signal = power[:, f] + power[:, g]
+        k = np.flatnonzero(seen[:, f] & seen[:, g] & (signal > 0.0))
+        if len(k) < _FEWEST_FRAMES:
+            continue
+        noise = motion.var[k, f] + motion.var[k, g]
+        weight = signal[k] / (signal[k] + noise) / noise
+        u_f, u_g = motion.u[k, f], motion.u[k, g]
+        bias = 3.0 * float((weight * noise).sum())
+        apart = float((weight * ((u_f - u_g) ** 2).sum(-1)).sum()) - bias
+        total = float((weight * ((u_f**2).sum(-1) + (u_g**2).sum(-1))).sum()) - bias
+        if total > 0.0:
+            ratio[i] = apart / total
+            sigma[i] = np.sqrt(6.0 * float(((weight * noise) ** 2).sum())) / total
+    return ratio, sigma
+
+
+def _power(motion: Motion, seen: BoolArray) -> Array:
+    """How far each flower (n, l) stood from rest around each frame, m^2 along any axis, from the other frames alone."""
+    stamps = motion.stamps
+    dt = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
+    half = max(1, round(0.5 * _WINDOW_S / dt))
+    information: Array = np.where(seen, 1.0 / np.where(seen, motion.var, 1.0), 0.0)
+    total = _others(information, half)
+    noise: Array = 1.0 / np.where(_others(1.0 * seen, half) > 0.5, total, np.inf)
+    u: Array = np.where(seen[..., None], motion.u, 0.0)
+    square = np.zeros_like(total)
+    for axis in range(3):
+        square += (noise * _others(information * u[..., axis], half)) ** 2
+    power: Array = np.where((noise > 0.0) & (square > _SIGNIFICANT * noise), square / 3.0 - noise, 0.0)
+    return power
+
+
+def _others(x: NDArray[Any], half: int) -> Array:
+    """Sums over the ``half`` rows before and after each row of x (n, l)."""
+    total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, axis=0)])
+    i = np.arange(len(x))
+    summed: Array = total[np.minimum(i + half + 1, len(x))] - total[np.maximum(i - half, 0)] - x
+    return summed

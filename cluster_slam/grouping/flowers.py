@@ -1,0 +1,98 @@
+"""Which flowers are one cluster: by spacing and by common motion, with no number given; by K-means; or by branch."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.cluster.vq import kmeans2
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import squareform
+
+from cluster_slam.config import GroupingConfig
+from cluster_slam.errors import ConfigError
+from cluster_slam.geometry import Array
+from cluster_slam.grouping.comotion import Motion, motion_evidence
+from cluster_slam.grouping.partition import Likelihood, improve, likeliest_cut
+from cluster_slam.records import IntArray
+
+_FEWEST = 3  # members of what is called a cluster where nothing else says that flowers come in clusters
+_REACH = 7.0  # spacings; flowers that far apart are of two clusters, whatever they do
+
+
+def group_flowers(
+    places: Array,
+    presence: csr_matrix,
+    motion: Motion | None,
+    view_volume: float,
+    config: GroupingConfig,
+    *,
+    rng: np.random.Generator,
+) -> IntArray:
+    """Cluster 0..c-1 of each flower (l,).
+
+    Parameters
+    ----------
+    places : (l, 3) at rest, m.
+    presence : (l, n) which frames saw each flower.
+    motion : what is known of the flowers' motion, or None.
+    view_volume : m^3, how much space one look of the camera holds.
+    config : the method.
+    rng : for K-means.
+    """
+    n = len(places)
+    if config.method == "none" or n == 0:
+        return np.arange(n)
+    if config.method == "kmeans":
+        if config.n_clusters is None:
+            raise ConfigError("grouping.method kmeans wants grouping.n_clusters")
+        return _numbered(kmeans2(places, min(config.n_clusters, n), minit="++", rng=rng)[1])
+    if n == 1:
+        return np.zeros(1, dtype=np.int64)
+    spacing = _spacing(places)
+    evidence = None if motion is None else motion_evidence(places, motion, _REACH * spacing)
+    tree = _tree(places, evidence, "single" if config.method == "branch" else "average")
+    if config.linkage_m is not None:
+        return _numbered(fcluster(tree, config.linkage_m, "distance"))
+    likelihood = Likelihood(places, view_volume, spacing, evidence)
+    label = likeliest_cut(tree, likelihood)
+    if config.method == "spacing":
+        label = improve(label, likelihood)
+    return _numbered(label) if _come_in_clusters(places, presence, label) else np.arange(n)
+
+
+def _numbered(label: NDArray[Any]) -> IntArray:
+    """Labels 0..c-1 in the order of first appearance."""
+    _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), dtype=np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[inverse]
+
+
+def _spacing(places: Array) -> float:
+    """Median distance of a flower to its nearest, m."""
+    return float(np.median(np.asarray(cKDTree(places).query(places, k=2)[0])[:, 1]))
+
+
+def _tree(places: Array, evidence: csr_matrix | None, method: Literal["single", "average"]) -> Array:
+    """Linkage tree of distances, which evidence against common motion stretches and evidence for it shrinks."""
+    distance = np.linalg.norm(places[:, None] - places[None], axis=-1)
+    if evidence is not None:
+        pairs = evidence.tocoo()
+        distance[pairs.row, pairs.col] *= np.interp(pairs.data, [-2.0, 0.0, 2.0], [2.5, 1.0, 0.8])
+    tree: Array = linkage(squareform(distance, checks=False), method)
+    return tree
+
+
+def _come_in_clusters(places: Array, presence: csr_matrix, label: IntArray) -> bool:
+    """Whether this session's flowers come in clusters at all: some have three members, which are seen together."""
+    if np.unique(label, return_counts=True)[1].max() < _FEWEST:
+        return False
+    nearest = np.asarray(cKDTree(places).query(places, k=2)[1])[:, 1]
+    both = np.asarray(presence.multiply(presence[nearest]).sum(axis=1)).ravel()
+    count = np.asarray(presence.sum(axis=1)).ravel()
+    together = both / np.maximum(count + count[nearest] - both, 1)
+    return bool(np.median(together) > 0.3)

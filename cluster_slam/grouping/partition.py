@@ -1,0 +1,127 @@
+"""The likeliest partition of flowers into clusters, from where they stand and from what their motion says.
+
+Clusters stand anywhere in the space that was looked at; members scatter about their centroid with one sigma for all
+clusters; the number of members is Poisson. To this comes the evidence of each pair within a cluster; of the pairs
+among n members only n - 1 say something new, so each counts 2 / n.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
+from scipy.special import gammaln
+
+from cluster_slam.geometry import Array
+from cluster_slam.records import IntArray
+
+_NEIGHBOURS = 6  # whose clusters a flower may move to
+_MAX_SWEEPS = 10
+
+
+class Likelihood:
+    """Log-likelihood of partitions of flowers at ``places`` (l, 3)."""
+
+    def __init__(self, places: Array, volume: float, spacing: float, evidence: csr_matrix | None) -> None:
+        """``volume`` m^3 that was looked at, ``spacing`` m to the nearest flower, ``evidence`` (l, l) of motion."""
+        sides = np.ptp(places, axis=0)
+        self.places = places
+        self.volume = max(float(np.prod(np.maximum(sides, 0.1 * sides.max()))), volume)
+        self.prior_sigma = 0.7 * spacing
+        pairs = None if evidence is None else evidence.tocoo()
+        keep = np.empty(0, dtype=bool) if pairs is None else pairs.row < pairs.col
+        self.row = np.empty(0, dtype=np.int64) if pairs is None else pairs.row[keep].astype(np.int64)
+        self.col = np.empty(0, dtype=np.int64) if pairs is None else pairs.col[keep].astype(np.int64)
+        self.evidence = np.empty(0) if pairs is None else pairs.data[keep]
+
+    def __call__(self, label: IntArray) -> float:
+        """Of the clusters that ``label`` (l,) names with any integers."""
+        _, label, size = np.unique(label, return_inverse=True, return_counts=True)
+        return self._scatter(label, size) + self._motion(label, size)
+
+    def _scatter(self, label: IntArray, size: IntArray, prior_weight: float = 1.0) -> float:
+        """Sigma takes its most probable value; a weak prior keeps it from zero."""
+        centre = np.stack([np.bincount(label, self.places[:, a]) for a in range(3)], axis=-1) / size[:, None]
+        n, c = len(self.places), len(size)
+        square = float(((self.places - centre[label]) ** 2).sum())
+        dof = 3.0 * (n - c)
+        var = (square + 3.0 * prior_weight * self.prior_sigma**2) / (dof + 3.0 * prior_weight)
+        scatter = -0.5 * dof * np.log(2.0 * np.pi * var) - 0.5 * square / var - 1.5 * np.log(size).sum()
+        mean = n / c
+        members = (size * np.log(mean) - mean - gammaln(size + 1.0)).sum()
+        return float(scatter - c * np.log(self.volume) + members)
+
+    def _motion(self, label: IntArray, size: IntArray) -> float:
+        within = label[self.row] == label[self.col]
+        return float((self.evidence[within] * 2.0 / size[label[self.row[within]]]).sum())
+
+
+def likeliest_cut(tree: Array, likelihood: Likelihood) -> IntArray:
+    """Of all cuts of a linkage tree the likeliest."""
+    best: IntArray = np.arange(len(likelihood.places), dtype=np.int64)
+    best_score = -np.inf
+    for height in np.concatenate([[0.0], np.unique(tree[:, 2]) * (1.0 + 1e-12)]):
+        label = fcluster(tree, height, "distance").astype(np.int64) - 1
+        score = likelihood(label)
+        if score > best_score:
+            best, best_score = label, score
+    return best
+
+
+def improve(label: IntArray, likelihood: Likelihood) -> IntArray:
+    """Move single flowers, join neighbours and split clusters as long as that makes the partition likelier."""
+    label, score = label.copy(), likelihood(label)
+    neighbours = _neighbours(likelihood.places)
+    for _ in range(_MAX_SWEEPS):
+        before = score
+        for f in range(len(label)):
+            score = _try_each(label, score, likelihood, _moves(label, f, neighbours[f]))
+        for a in np.unique(label).tolist():
+            score = _try_each(label, score, likelihood, _splits(label, a, likelihood.places))
+            score = _try_each(label, score, likelihood, _joins(label, a, neighbours))
+        if score <= before + 1e-9:
+            break
+    return label
+
+
+def _try_each(label: IntArray, score: float, likelihood: Likelihood, changes: list[tuple[IntArray, int]]) -> float:
+    """Carry out, in place, the change that helps most, if any: these flowers get that label."""
+    best: tuple[IntArray, int] | None = None
+    for flowers, new in changes:
+        old = label[flowers]
+        label[flowers] = new
+        value = likelihood(label)
+        label[flowers] = old
+        if value > score + 1e-9:
+            best, score = (flowers, new), value
+    if best is not None:
+        label[best[0]] = best[1]
+    return score
+
+
+def _neighbours(places: Array) -> IntArray:
+    k = min(_NEIGHBOURS + 1, len(places))
+    return np.asarray(cKDTree(places).query(places, k=k)[1])[:, 1:].astype(np.int64)
+
+
+def _moves(label: IntArray, f: int, neighbours: IntArray) -> list[tuple[IntArray, int]]:
+    """The flower to a neighbour's cluster, or into one of its own."""
+    others = [int(j) for j in np.unique(label[neighbours]) if j != label[f]]
+    alone = [] if (label == label[f]).sum() == 1 else [int(label.max()) + 1]
+    return [(np.array([f]), j) for j in others + alone]
+
+
+def _joins(label: IntArray, a: int, neighbours: IntArray) -> list[tuple[IntArray, int]]:
+    """The whole cluster to one of its neighbours."""
+    mine = np.flatnonzero(label == a)
+    return [(mine, int(j)) for j in np.unique(label[neighbours[mine]]) if j != a] if len(mine) else []
+
+
+def _splits(label: IntArray, a: int, places: Array) -> list[tuple[IntArray, int]]:
+    """The cluster in two, where it is widest."""
+    mine = np.flatnonzero(label == a)
+    if len(mine) < 4:
+        return []
+    half = fcluster(linkage(places[mine], "average"), 2, "maxclust")
+    return [(mine[half == 2], int(label.max()) + 1)]

@@ -1,0 +1,89 @@
+"""Clusters from spacing and from common motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_matrix
+
+from cluster_slam.config import GroupingConfig
+from cluster_slam.geometry import Array
+from cluster_slam.grouping import Motion, group_flowers
+from cluster_slam.grouping.comotion import log_likelihood_ratio, motion_evidence
+from cluster_slam.grouping.partition import Likelihood, improve
+
+N_FRAMES = 600
+STAMPS = np.arange(N_FRAMES) / 30.0
+NOISE_M = 0.002
+
+
+def motion_of(label: Array, amplitude: float, *, rng: np.random.Generator) -> Motion:
+    """Flowers of clusters that each swing with a frequency and phase of their own, seen with noise."""
+    swing = [amplitude * np.sin(2 * np.pi * f * STAMPS[:, None] + rng.uniform(0, 6, 3)) for f in (0.9, 1.7)]
+    u = np.stack([swing[j] for j in label], axis=1)
+    return Motion(u + NOISE_M * rng.standard_normal(u.shape), np.full(u.shape[:2], NOISE_M**2), STAMPS)
+
+
+def two_crossed_clusters() -> tuple[Array, Array]:
+    """Six flowers along a line, whose clusters alternate: where they stand says the wrong thing."""
+    places = np.column_stack([0.02 * np.arange(6), np.zeros(6), np.ones(6)])
+    return places, np.array([0, 0, 1, 0, 1, 1])
+
+
+def grouped(places: Array, motion: Motion | None) -> Array:
+    presence = csr_matrix(np.ones((len(places), N_FRAMES)))
+    return group_flowers(places, presence, motion, 0.5, GroupingConfig(), rng=np.random.default_rng(0))
+
+
+def test_motion_overrules_spacing() -> None:
+    rng = np.random.default_rng(3)
+    places, label = two_crossed_clusters()
+    np.testing.assert_array_equal(grouped(places, motion_of(label, 0.01, rng=rng)), label)
+    assert len(np.unique(grouped(places, None))) == 1
+
+
+def test_sway_below_the_noise_of_one_frame_still_tells() -> None:
+    rng = np.random.default_rng(5)
+    places, label = two_crossed_clusters()
+    np.testing.assert_array_equal(grouped(places, motion_of(label, NOISE_M, rng=rng)), label)
+
+
+def test_no_motion_is_no_evidence() -> None:
+    rng = np.random.default_rng(7)
+    places, label = two_crossed_clusters()
+    evidence = motion_evidence(places, motion_of(label, 0.0, rng=rng), 0.2)
+    assert abs(evidence).max() < 1.5  # a few of 600 noisy frames pass the test of significance by chance
+
+
+@pytest.mark.parametrize(("ratio", "sign"), [(0.0, 1.0), (0.02, 1.0), (0.6, -1.0), (1.0, -1.0)])
+def test_evidence_has_the_sign_of_what_was_seen(ratio: float, sign: float) -> None:
+    value = log_likelihood_ratio(np.array([ratio]), np.array([0.02]), 0.0)[0]
+    assert sign * value > 1.5
+
+
+def test_a_poorly_known_ratio_says_little() -> None:
+    assert abs(log_likelihood_ratio(np.array([0.5]), np.array([2.0]), 0.0)[0]) < 0.2
+
+
+def test_evidence_by_hand() -> None:
+    # ratio 0, sigma 0, no turning: N(0; 0, 0.02) = 19.947 against N(0; 0.95, 0.35) = 0.02864, and 5 % of anything:
+    # (1 / 2.8 + N(0; 0.5, 0.7)) / 2 = (0.35714 + 0.44159) / 2 = 0.39937
+    expected = np.log((0.95 * 19.947 + 0.05 * 0.39937) / (0.95 * 0.02864 + 0.05 * 0.39937))
+    assert log_likelihood_ratio(np.array([0.0]), np.array([0.0]), 0.0)[0] == pytest.approx(expected, rel=1e-3)
+
+
+def test_improving_never_makes_it_less_likely() -> None:
+    rng = np.random.default_rng(11)
+    places = rng.uniform(0, 0.4, (30, 3))
+    likelihood = Likelihood(places, 0.5, 0.05, None)
+    start = rng.integers(0, 8, 30)
+    assert likelihood(improve(start, likelihood)) >= likelihood(start)
+
+
+def test_likelihood_does_not_depend_on_names() -> None:
+    rng = np.random.default_rng(13)
+    places = rng.uniform(0, 0.4, (12, 3))
+    label = rng.integers(0, 4, 12)
+    evidence = csr_matrix(np.where(np.eye(12) > 0, 0.0, 1.0))
+    likelihood = Likelihood(places, 0.5, 0.05, evidence)
+    assert likelihood(label) == pytest.approx(likelihood(7 - 2 * label), abs=1e-9)
