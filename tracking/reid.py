@@ -175,11 +175,11 @@ def association_probabilities(log_ratio: Array, n_rounds: int = 50) -> tuple[Arr
     pairs (r, c), new (r,), gone (c,)
         Rows of ``pairs`` and ``new`` sum to one.
     """
-    ratio = np.exp(np.clip(log_ratio, -60.0, 60.0)) * np.isfinite(log_ratio)
+    ratio = np.exp(np.clip(log_ratio, -25.0, 25.0)) * np.isfinite(log_ratio)
     back = np.ones_like(ratio)  # from column to row
     for _ in range(n_rounds):
         weighted = ratio * back
-        forth = ratio / (1.0 + weighted.sum(axis=1, keepdims=True) - weighted)
+        forth = ratio / (1.0 + np.maximum(weighted.sum(axis=1, keepdims=True) - weighted, 0.0))
         back = 1.0 / (1.0 + np.maximum(forth.sum(axis=0) - forth, 0.0))
     weighted = ratio * back
     total = 1.0 + weighted.sum(axis=1)

@@ -14,7 +14,9 @@ from tracking.assignment import assign
 from tracking.reid import association_probabilities
 
 ELSEWHERE = 0.01  # prior of a flower that was grouped with another cluster than the map has it in
-TAIL_SHARE, TAIL = 0.05, 3.0  # of the flowers: errors so many times as large
+TAIL = 3.0  # some flowers' errors are so many times as large ...
+TAIL_SHARE = 0.01  # ... this share of them, ...
+TAIL_SHARE_SINGLE = 0.05  # ... or this, where each flower stands for itself
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,9 +62,10 @@ def _flower_ratios(session: Constellation, match: Found) -> Array:
     own = match.scale**2 * np.trace(session.flower_covs, axis1=1, axis2=2) / 3.0
     squared = ((points[:, None] - where) ** 2).sum(-1)
     total = own[:, None] + var
+    tail = TAIL_SHARE_SINGLE if match.single else TAIL_SHARE
     log_density = np.logaddexp(
-        np.log1p(-TAIL_SHARE) - 0.5 * squared / total - 0.5 * d * np.log(2 * np.pi * total),
-        np.log(TAIL_SHARE) - 0.5 * squared / (TAIL**2 * total) - 0.5 * d * np.log(2 * np.pi * TAIL**2 * total),
+        np.log1p(-tail) - 0.5 * squared / total - 0.5 * d * np.log(2 * np.pi * total),
+        np.log(tail) - 0.5 * squared / (TAIL**2 * total) - 0.5 * d * np.log(2 * np.pi * TAIL**2 * total),
     )
     seen = np.clip(scene.config.seen_share * match.plant.flower_presence, 1e-3, 0.999)
     null, prior = _strangers(session, match)

@@ -76,24 +76,23 @@ def match(
     similarity
         Let the unit of length differ by a factor between ``config.scale_min`` and ``config.scale_max``.
     """
-    config = config or MatchConfig()
+    config, growth = config or MatchConfig(), growth or GrowthConfig()
     alive = _alive(plant)
     candidates: list[_Candidate] = []
     repeated = False
     for space, single in _ways(session, alive):
-        scene = _scene(session, alive, space, config, growth or GrowthConfig(), single=single, similarity=similarity)
+        scene = _scene(session, alive, space, config, growth, single=single, similarity=similarity)
         if scene is None:
             continue
         explained, again = _search(scene)
         repeated |= again
-        pool = [_Candidate(space, scene, e, _evidence(scene, e), single) for e in explained]
-        candidates += pool
+        candidates += [_Candidate(space, scene, e, _evidence(scene, e, single), single) for e in explained]
     if not candidates:
         return Match(plant.name, 0.0, -np.inf, -np.inf, False)
     best = max(candidates, key=lambda c: c.evidence)
     others = [c.evidence for c in candidates if _says_something_else(best, c)]
     name, runner_up = plant.name, max(others, default=-np.inf)
-    found = _found(session, alive, best, similarity)
+    found = _found(session, alive, best, growth, similarity)
     return Match(name, best.found.log_ratio, best.evidence, runner_up, repeated, found)
 
 
@@ -170,7 +169,7 @@ def _search(scene: Scene) -> tuple[list[Explained], bool]:
     return sorted(refined, key=lambda e: -e.log_ratio), repeated
 
 
-def _evidence(scene: Scene, found: Explained) -> float:
+def _evidence(scene: Scene, found: Explained, single: bool) -> float:
     """Log likelihood ratio with the pose integrated out (Laplace): the peak times its volume over the prior's.
 
     The prior is uniform over all turns and over places where the session overlaps the plant.
@@ -190,7 +189,21 @@ def _evidence(scene: Scene, found: Explained) -> float:
         size = np.sqrt(((pairs.a - pairs.a.mean(0)) ** 2).sum() * len(pairs.a) / max(pairs.n_units, 1) / len(pairs.a))
         sigma = np.sqrt(float(np.median(pairs.var_offset + pairs.variance.mean())) / max(pairs.n_units, 1)) / size
         occam += min(0.0, np.log(2.5 * sigma / (scene.scale_range[1] - scene.scale_range[0])))
-    return float(found.log_ratio + min(occam, 0.0))
+    torn = _torn(scene, found) if single else 0.0
+    return float(found.log_ratio + min(occam, 0.0) + torn)
+
+
+def _torn(scene: Scene, found: Explained) -> float:
+    """What flowers cost that were matched one by one and left others of their cluster alone.
+
+    Cluster by cluster, the missing and the new are part of a pair's score; this makes the two comparable.
+    """
+    known = scene.known
+    touched = np.isin(known.cluster, known.cluster[found.known])
+    touched[found.known] = False
+    missing = np.log1p(-known.seen[touched, 0]).sum()
+    fresh = np.isin(scene.query.cluster, scene.query.cluster[found.query])
+    return float(missing + (fresh.sum() - len(found)) * np.log(scene.background.n_new))
 
 
 def _in_three(pairs: Pairs) -> Pairs:
@@ -215,7 +228,18 @@ def _flower_pairs(candidate: _Candidate) -> set[tuple[int, int]]:
     return set(zip(a.tolist(), b.tolist(), strict=True))
 
 
-def _found(session: Constellation, alive: PlantMap, best: _Candidate, similarity: bool) -> Found | None:
+def _drifted(plant: PlantMap, days: float, growth: GrowthConfig) -> float:
+    """Variance along each axis of a cluster's drift since the plant's first session.
+
+    What the clusters of a plant drifted in common cannot be told from a base that stands elsewhere, however often they
+    were seen between: the transform to the frame of the first session is only as sure as their mean drift.
+    """
+    return plant.drift_rate**2 * days**2 / 3.0 + growth.walk_m_per_sqrt_day**2 * abs(days)
+
+
+def _found(
+    session: Constellation, alive: PlantMap, best: _Candidate, growth: GrowthConfig, similarity: bool
+) -> Found | None:
     scene, found = best.scene, best.found
     if best.single:
         scene, found = warped(scene, found)
@@ -225,6 +249,8 @@ def _found(session: Constellation, alive: PlantMap, best: _Candidate, similarity
     row, member = np.nonzero(found.partner >= 0)
     a = session.flowers[scene.query.flower[found.query[row], member]]
     pairs = replace(matched_pairs(scene, found), a=a, b=a)
+    since = float(np.nan_to_num(session.start - np.fmin.reduce(alive.cluster_first_seen, initial=np.nan))) / DAY_S
+    pairs = replace(pairs, var_offset=np.maximum(pairs.var_offset, _drifted(alive, since, growth)))
     cov = pose_covariance(pairs, scale, with_scale=similarity)
     return Found(
         alive, best.space.to_map(pose.R[0], pose.t[0], scale), scale, cov, best.space, scene, found, best.single

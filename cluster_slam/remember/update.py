@@ -14,6 +14,7 @@ from cluster_slam.geometry import Array, rotate_cov, transform
 from cluster_slam.records import BoolArray, Constellation, IntArray, PlantMap
 from tracking.presence import after_group_miss, after_miss, any_present, persisted
 
+PRIOR_CLUSTERS = 4.0  # the prior of the drift's size counts as so many clusters
 _CLUSTER = (
     *("cluster_ids", "clusters", "cluster_covs", "cluster_time", "velocities", "velocity_covs"),
     *("position_velocity_covs", "growth_rates", "growth_vars", "n_flowers", "descriptors", "descriptor_covs"),
@@ -91,9 +92,9 @@ def update(
     kept = _Work(plant, moved, session, where, who, config, now)
     kept.follow_clusters()
     kept.look(looked)
-    grown, cluster_ids, flower_ids = _with_new(
-        kept.result(), session, where, who, config, now, next_cluster, next_flower
-    )
+    kept.learn_growth()
+    after = replace(kept.result(), drift_rate=kept.learn_drift())
+    grown, cluster_ids, flower_ids = _with_new(after, session, where, who, config, now, next_cluster, next_flower)
     missed = plant.cluster_ids[kept.missed]
     return Updated(_summarised(grown), cluster_ids, flower_ids, missed)
 
@@ -122,6 +123,7 @@ class _Work:
         self.partner[who.flower[found]] = found
         self.seen = np.zeros(len(plant.cluster_ids), dtype=bool)
         self.missed = np.zeros(len(plant.cluster_ids), dtype=bool)
+        self.measured: dict[int, tuple[float, float]] = {}  # growth rate of a cluster, and its variance
 
     def follow_clusters(self) -> None:
         """Each cluster of which flowers were seen again is moved to where they are, and its drift is learned."""
@@ -151,7 +153,7 @@ class _Work:
         v["velocity_covs"][c] = _symmetric(V - Kv @ C)
         v["position_velocity_covs"][c] = C - K @ C
         v["cluster_time"][c] = v["cluster_last_seen"][c] = v["cluster_last_looked_at"][c] = self.now
-        self._grow(c, found, theirs, weight)
+        self._measure_growth(c, found, theirs, weight)
         v["flowers"][members] = moved.flowers[members] + offset
         v["flower_covs"][members] = moved.flower_covs[members]
         F, Q = moved.flower_covs[found], self.where.covs[theirs]
@@ -159,8 +161,41 @@ class _Work:
         v["flowers"][found] += (gain @ (residual - offset)[..., None])[..., 0]
         v["flower_covs"][found] = _symmetric(F - gain @ F)
 
-    def _grow(self, c: int, found: IntArray, theirs: IntArray, weight: Array) -> None:
-        """Learn how fast a cluster's lengths grow from the spread of the flowers that were seen again."""
+    def learn_growth(self) -> None:
+        """Growth rates from what was measured: first what all clusters have in common, then each cluster's own.
+
+        Two levels of Gaussians: rate of a cluster = common rate + its own part, of ``size_spread`` times its sigma.
+        """
+        v, growth = self.values, self.config.growth
+        if not self.measured:
+            return
+        rows = np.array(sorted(self.measured))
+        rate, var = np.array([self.measured[c] for c in rows.tolist()]).T
+        own = (growth.size_spread * growth.size_sigma_per_day / DAY_S) ** 2
+        prior = np.maximum(v["growth_vars"][rows], own)
+        shift = rate - v["growth_rates"][rows]
+        common_prior = float(np.maximum(np.median(prior) - own, 1e-2 * own))
+        weight = 1.0 / (own + var)
+        common = float(weight @ shift) / (float(weight.sum()) + 1.0 / common_prior)
+        common_var = 1.0 / (float(weight.sum()) + 1.0 / common_prior)
+        v["growth_rates"] = v["growth_rates"] + common
+        v["growth_vars"] = np.minimum(v["growth_vars"], own + common_var)
+        gain = own / (own + var)
+        v["growth_rates"][rows] += gain * (shift - common)
+        v["growth_vars"][rows] = (1.0 - gain) * own + common_var
+
+    def learn_drift(self) -> float:
+        """RMS norm of the clusters' drift, m/day: one step of expectation maximisation with a weak prior."""
+        v, prior = self.values, self.plant.drift_rate
+        rows = np.flatnonzero(self.seen & (np.abs(self.dt) > 0.25 * DAY_S))
+        if len(rows) < 4:
+            return prior
+        speed_sq = (v["velocities"][rows] ** 2).sum(1) + np.trace(v["velocity_covs"][rows], axis1=1, axis2=2)
+        total = PRIOR_CLUSTERS * prior**2 + DAY_S**2 * float(speed_sq.sum())
+        return float(np.sqrt(total / (PRIOR_CLUSTERS + len(rows))))
+
+    def _measure_growth(self, c: int, found: IntArray, theirs: IntArray, weight: Array) -> None:
+        """How fast a cluster's lengths grew, from the spread of the flowers that were seen again: rate and variance."""
         dt = self.dt[c]
         if len(found) < 3 or dt <= 0:
             return
@@ -169,10 +204,7 @@ class _Work:
         size = float(weight @ (b * b).sum(1))
         ratio = max(float(weight @ (a * b).sum(1)) / size, 0.1)
         var = 1.0 / size / dt**2  # of the rate that the ratio tells
-        prior = self.moved.growth_vars[c]
-        gain = prior / (prior + var)
-        self.values["growth_rates"][c] += gain * np.log(ratio) / dt
-        self.values["growth_vars"][c] = (1.0 - gain) * prior
+        self.measured[c] = self.moved.growth_rates[c] + np.log(ratio) / dt, var
 
     def look(self, looked: BoolArray) -> None:
         """Presence of what was seen, and of what was looked at and not seen."""

@@ -56,8 +56,12 @@ def simulate(config: SimulateConfig, out: Path, *, seed: int) -> None:
     write_session(out, made.session, made.truth, camera=made.camera, moments=moments)
 
 
-def simulate_session(config: SimulateConfig, *, seed: int) -> Simulated:
+def simulate_session(
+    config: SimulateConfig, *, seed: int, plant: Plant | None = None, visited: Plant | None = None
+) -> Simulated:
     """Simulate a recording in memory. The same configuration and seed give the same arrays in any process.
+
+    ``plant`` (None: one is grown) is recorded by a camera that sweeps past ``visited`` (None: all of the plant).
 
     Raises
     ------
@@ -67,10 +71,10 @@ def simulate_session(config: SimulateConfig, *, seed: int) -> Simulated:
     if seed < 0:
         raise ConfigError(f"the seed must be a whole number from 0, not {seed}")
     times = np.arange(config.n_frames) / config.fps
-    plant = grow_plant(config, rng=_rng(seed, "plant"))
+    plant = plant or grow_plant(config, rng=_rng(seed, "plant"))
     motion = move(config, plant, times, rng=_rng(seed, "motion"))
     flowers = flower_positions(plant, motion)
-    T_world_camera = camera_path(config, plant, times, rng=_rng(seed, "path"))
+    T_world_camera = camera_path(config, visited or plant, times, rng=_rng(seed, "path"))
     hand_eye = mount_camera(config, rng=_rng(seed, "mount"))
     leaves = grow_leaves(config, plant, times, rng=_rng(seed, "leaves"))
     visible = visible_flowers(config, T_world_camera, flowers, leaves)
