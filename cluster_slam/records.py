@@ -66,6 +66,18 @@ class Observations:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ImageDetections:
+    """Flowers in one picture, as a detector found them: boxes, best first."""
+
+    centres: Array  # (k, 2) u and v of the box's middle, pixels
+    sizes: Array  # (k, 2) width and height, pixels
+    scores: Array  # (k,) 0 to 1
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """One instant as it arrives live: when, the pose that the robot or the odometry gave, and what was seen.
 

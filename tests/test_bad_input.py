@@ -210,5 +210,5 @@ def test_levels_that_are_not_there(tmp_path: Path) -> None:
         open_session(folder, level=2)
     with pytest.raises(InputError, match=r"level 7, expected"):
         open_session(folder, level=7)
-    with pytest.raises(InputError, match=r"images only \(level 1\), expected flowers.csv or detections.csv"):
+    with pytest.raises(InputError, match=r"images only \(level 1\), expected a detector"):
         open_session(folder, level=1)

@@ -15,6 +15,7 @@ from cluster_slam import __version__
 from cluster_slam.cli import (
     check,
     compare,
+    detect,
     evaluate,
     figures,
     localise,
@@ -66,6 +67,7 @@ app.command("track", short_help="Follow clusters frame by frame, as if live.")(t
 app.command("simulate")(simulate.command)
 app.command("evaluate")(evaluate.command)
 app.command("check")(check.command)
+app.command("detect", short_help="Find flowers in pictures.")(detect.command)
 app.command("figures")(figures.command)
 app.command("compare-descriptors")(compare.command)
 app.command("localise")(localise.command)

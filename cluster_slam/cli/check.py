@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cluster_slam.cli.detect import detector_for
 from cluster_slam.cli.options import JsonOption, QuietOption, SessionArgument
 from cluster_slam.cli.summary import print_json, print_table, print_warnings
 
@@ -16,7 +17,8 @@ if TYPE_CHECKING:
 def command(
     session: SessionArgument,
     level: Annotated[
-        int | None, typer.Option("--level", help="3 flowers, 2 detections; default: the highest.", show_default=False)
+        int | None,
+        typer.Option("--level", help="3 flowers, 2 detections, 1 pictures; default: the highest.", show_default=False),
     ] = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
@@ -29,7 +31,7 @@ def command(
     """
     from cluster_slam.io.session import open_session, open_truth
 
-    opened = open_session(session, level=level)
+    opened = open_session(session, level=level, detector=detector_for(session, level, None, None))
     facts = session_facts(opened, open_truth(session, opened))
     if as_json:
         print_json({**facts, "warnings": list(opened.warnings)})

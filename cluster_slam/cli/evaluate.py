@@ -27,9 +27,9 @@ def command(
     from cluster_slam.evaluation import evaluate
     from cluster_slam.io.read_result import read_result
     from cluster_slam.io.run_record import read_run
-    from cluster_slam.io.session import open_session, open_truth
+    from cluster_slam.io.session import OBSERVED, open_session, open_truth
 
-    opened = open_session(session, level=read_run(result / "run.json").level)
+    opened = open_session(session, level=read_run(result / "run.json").level, observed=result / OBSERVED)
     truth = open_truth(session, opened)
     if truth is None:
         raise InputError(f"{session / 'truth'}: missing, expected ground truth to compare with")

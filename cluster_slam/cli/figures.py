@@ -32,7 +32,7 @@ def command(
     """
     from cluster_slam.io.folder import check_writable
     from cluster_slam.io.run_record import read_run
-    from cluster_slam.io.session import open_session
+    from cluster_slam.io.session import OBSERVED, open_session
     from cluster_slam.report.figures import write_figures
     from cluster_slam.report.folder import open_result
 
@@ -41,7 +41,7 @@ def command(
     check_writable(out)
     run = read_run(result / "run.json")
     folder = session or (run.session_path if run.session_path and run.session_path.is_dir() else None)
-    opened = None if folder is None else open_session(folder, level=run.level)
+    opened = None if folder is None else open_session(folder, level=run.level, observed=result / OBSERVED)
     if opened is None and not quiet:
         print_warnings([f"{result}: its session {run.session_path} is not there, so figures lack what only it knows"])
     paths = write_figures(open_result(result, opened), out, formats=formats.replace(" ", "").split(","), dpi=dpi)

@@ -20,7 +20,11 @@ def command(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Session folder to write.", show_default=False)],
     preset: Annotated[
         str,
-        typer.Option("--preset", metavar="NAME", help="moderate, hard, sample, or a strange one as moderate-tails."),
+        typer.Option(
+            "--preset",
+            metavar="NAME",
+            help="moderate, hard, sample, or a strange one as moderate-tails; moderate-images renders.",
+        ),
     ] = "moderate",
     seed: SeedOption = 0,
     config: ConfigOption = None,
@@ -46,7 +50,7 @@ def command(
     options = configured(PRESETS[preset], config, settings or [])
     with StageProgress(is_shown=not (quiet or as_json)) as progress:
         progress("simulating", 0.0)
-        simulate(options, out, seed=seed)
+        simulate(options, out, seed=seed, progress=progress)
     if as_json:
         print_json({"out": str(out), "preset": preset, "seed": seed, "config": asdict(options)})
     elif not quiet:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cluster_slam.cli.detect import DetectorOption, ModelOption, detector_for
 from cluster_slam.cli.options import (
     ConfigOption,
     JsonOption,
@@ -37,8 +38,11 @@ def command(
     config: ConfigOption = None,
     settings: SetOption = None,
     level: Annotated[
-        int | None, typer.Option("--level", help="3 flowers, 2 detections; default: the highest.", show_default=False)
+        int | None,
+        typer.Option("--level", help="3 flowers, 2 detections, 1 pictures; default: the highest.", show_default=False),
     ] = None,
+    model: ModelOption = None,
+    detector: DetectorOption = None,
     seed: SeedOption = 0,
     grouping: Annotated[
         str | None,
@@ -64,10 +68,11 @@ def command(
     check_output(out)
     options = smooth_config(config, settings or [], grouping, clusters)
     started = perf_counter()
-    opened = open_session(session, level=level)
-    truth = open_truth(session, opened)
-    read_s = perf_counter() - started
+    finder = detector_for(session, level, model, detector)
     with StageProgress(is_shown=not (quiet or as_json)) as progress:
+        opened = open_session(session, level=1 if finder else level, detector=finder, progress=progress)
+        truth = open_truth(session, opened)
+        read_s = perf_counter() - started
         result, metrics, files = _work(opened, truth, options, seed, read_s, progress)
         write_result(result, out, extra_files=files)
     known = {} if metrics is None else metrics.as_json()
@@ -107,6 +112,8 @@ def _work(
     from dataclasses import asdict, replace
 
     from cluster_slam.evaluation import evaluate
+    from cluster_slam.io.session import OBSERVED
+    from cluster_slam.io.session_writer import observed_table
     from cluster_slam.pipeline.smooth import smooth
     from cluster_slam.report.page import render_report
 
@@ -122,6 +129,8 @@ def _work(
     more = {"read": read_s, "evaluate": evaluated - begin, "report": perf_counter() - evaluated}
     result = replace(result, timings_s={**result.timings_s, **more})
     files: dict[str, str | bytes] = {"report.html": page}
+    if session.level == 1:  # what was detected, so that no picture need be opened again
+        files[OBSERVED] = observed_table(session)
     if metrics is not None:
         files["metrics.json"] = json.dumps(metrics.as_json(), indent=2, allow_nan=False) + "\n"
     return result, metrics, files

@@ -36,6 +36,7 @@ class Depth(BaseModel):
     model_config = _OPEN
     scale: Sigma = 0.001
     convention: Literal["z", "ray"] = "z"
+    camera: Literal["generic", "d405", "d435"] | None = None
 
 
 class Noise(BaseModel):

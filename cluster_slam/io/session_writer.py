@@ -16,8 +16,11 @@ from cluster_slam.io.result import stamp_words
 from cluster_slam.records import IntArray, Session, Truth
 from cluster_slam.sensors.camera import Camera
 
-SESSION_FILES = frozenset({"session.toml", "poses.txt", "flowers.csv", "detections.csv", "camera.yaml", "truth"})
-TRUTH_FILES = frozenset({"poses.txt", "observations.csv", "flowers.csv", "rest.csv"})
+SESSION_FILES = frozenset(
+    {"session.toml", "poses.txt", "flowers.csv", "detections.csv", "camera.yaml", "truth"}
+    | {"rgb.txt", "depth.txt", "rgb", "depth"}
+)
+TRUTH_FILES = frozenset({"poses.txt", "observations.csv", "flowers.csv", "rest.csv", "boxes.csv"})
 _TUM = "# timestamp tx ty tz qx qy qz qw"
 _COV_NAMES = "cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz"
 _UPPER = np.triu_indices(3)
@@ -80,18 +83,40 @@ def write_session(
         The folder cannot be written or holds something else; what was there is untouched.
     """
     check_session_output(out)
+    write_folder(out, session_files(session, truth, camera=camera, moments=moments))
+
+
+def session_files(
+    session: Session, truth: Truth | None = None, *, camera: Camera | None = None, moments: Moments | None = None
+) -> dict[str, str | bytes]:
+    """The files of a session by name; at level 1 all but the pictures and their lists.
+
+    Raises
+    ------
+    OutputError
+        The session needs a camera to be written.
+    """
     stamps = stamp_words(session.stamps)
-    files = {"session.toml": _metadata(session, truth), "poses.txt": _trajectory(stamps, session.poses)}
-    if session.level == 2:
+    files: dict[str, str | bytes] = {
+        "session.toml": _metadata(session, truth),
+        "poses.txt": _trajectory(stamps, session.poses),
+    }
+    if session.level < 3:
         if camera is None:
-            raise OutputError(f"{out}: a session of level 2 needs its camera to be written")
+            raise OutputError(f"{session.id}: a session of level {session.level} needs its camera to be written")
         files["camera.yaml"] = _camera_info(camera)
+    if session.level == 2 and camera is not None:
         files["detections.csv"] = _detections(stamps, session, camera)
-    else:
+    elif session.level == 3:
         files["flowers.csv"] = _flowers(stamps, session)
     if truth is not None:
         files |= {f"truth/{name}": text for name, text in _truth(stamps, truth, moments).items()}
-    write_folder(out, files)
+    return files
+
+
+def observed_table(session: Session) -> str:
+    """A session's observations as ``flowers.csv`` has them."""
+    return _flowers(stamp_words(session.stamps), session)
 
 
 def _metadata(session: Session, truth: Truth | None) -> str:
@@ -101,7 +126,7 @@ def _metadata(session: Session, truth: Truth | None) -> str:
     lines += ["", "[frames]", f'pose = "{session.pose_frame}"', f'pose_error = "{session.pose_error}"']
     if session.T_flange_camera is not None:
         lines.append(f"T_flange_camera = {_seven(session.T_flange_camera)}")
-    lines += ["", "[depth]", 'convention = "z"'] if session.level == 2 else []
+    lines += ["", "[depth]", 'convention = "z"'] if session.level < 3 else []
     lines += ["", "[noise]", *(f"{name} = {float(value)!r}" for name, value in asdict(session.noise).items())]
     if truth is not None and truth.T_map_world is not None:
         lines += ["", "[truth]", f"T_map_world = {_seven(truth.T_map_world)}"]

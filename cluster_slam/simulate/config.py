@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from math import inf, pi
 from typing import Any
 
 from cluster_slam.errors import ConfigError
 from cluster_slam.records import PoseError, PoseFrame
+from cluster_slam.simulate.render.config import LookConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +59,7 @@ class SimulateConfig:
     hand_eye_rotation: float = 0.5 * pi / 180  # rad
 
     # detections
-    level: int = 3  # 2: detections.csv and camera.yaml; 3: flowers.csv
+    level: int = 3  # 1: pictures; 2: detections.csv and camera.yaml; 3: flowers.csv
     pixel_sigma: float = 1.0  # px, of u and of v
     depth_sigma: float = 0.006  # sigma of the depth = depth_sigma * z^2, z in m
     stated_sigma_factor: float = 1.0  # stated sigmas over true ones
@@ -83,10 +84,12 @@ class SimulateConfig:
     ambient_sway_m: float = 0.0003  # rms an axis, at all times
     growth_m_per_s: float = 0.0  # slow drift of each cluster from its place at the start
 
+    look: LookConfig = field(default_factory=LookConfig)  # level 1: how the plant looks and the camera errs
+
     def __post_init__(self) -> None:
         for name in (f.name for f in fields(self)):
             value = getattr(self, name)
-            if not isinstance(value, str) and not 0 <= value < inf:
+            if not isinstance(value, str) and not is_dataclass(value) and not 0 <= value < inf:
                 raise ConfigError(f"{name} must be a number from 0, not {value}")
         for name in _POSITIVE:
             if not getattr(self, name) > 0:
@@ -123,7 +126,7 @@ _RANGES = (
 _CHOICES: tuple[tuple[str, tuple[str | int, ...]], ...] = (
     ("pose_frame", ("T_world_flange", "T_world_camera")),
     ("pose_error", ("absolute", "odometry")),
-    ("level", (2, 3)),
+    ("level", (1, 2, 3)),
 )
 
 MODERATE = SimulateConfig()
@@ -165,6 +168,7 @@ _STRANGE: dict[str, dict[str, Any]] = {
         "pose_rotation": 0.0005,
     },
     "pixels": {"level": 2},
+    "images": {"level": 1},
     "bare": {"with_covariances": False},
     "translation": {"turn_rad": 0.0},
     "long": {"duration_s": 5000 / 30},

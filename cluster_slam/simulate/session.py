@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from cluster_slam.records import CLUTTER, Observations, Session, StatedNoise, Tr
 from cluster_slam.sensors.camera import Camera
 from cluster_slam.simulate.camera_path import HandEye, camera_path, measured_poses, mount_camera
 from cluster_slam.simulate.config import SimulateConfig
-from cluster_slam.simulate.leaves import grow_leaves
+from cluster_slam.simulate.leaves import Leaves, grow_leaves
 from cluster_slam.simulate.motion import Motion, flower_positions, move
 from cluster_slam.simulate.plant import Plant, grow_plant
 from cluster_slam.simulate.sensor import Detections, camera_of, detect, visible_flowers
@@ -35,12 +36,17 @@ class Simulated:
     visible: NDArray[np.bool_]  # (n, f) in view and not hidden
     plant: Plant
     motion: Motion
+    leaves: Leaves
     hand_eye: HandEye
     camera: Camera
 
 
-def simulate(config: SimulateConfig, out: Path, *, seed: int) -> None:
+def simulate(
+    config: SimulateConfig, out: Path, *, seed: int, progress: Callable[[str, float], None] | None = None
+) -> None:
     """Write a simulated session with its truth into the folder ``out``, whole or not at all.
+
+    Level 1 is rendered; ``progress`` is then called with the stage in words and a fraction 0..1.
 
     Raises
     ------
@@ -53,6 +59,11 @@ def simulate(config: SimulateConfig, out: Path, *, seed: int) -> None:
     made = simulate_session(config, seed=seed)
     frames = np.unique(np.linspace(0, made.session.n_frames - 1, 10).round().astype(np.int64))
     moments = Moments(frames, made.flower_positions[frames])
+    if config.level == 1:
+        from cluster_slam.simulate.render.session import write_rendered
+
+        write_rendered(out, made, moments, seed=seed, progress=progress)
+        return
     write_session(out, made.session, made.truth, camera=made.camera, moments=moments)
 
 
@@ -71,19 +82,19 @@ def simulate_session(
     if seed < 0:
         raise ConfigError(f"the seed must be a whole number from 0, not {seed}")
     times = np.arange(config.n_frames) / config.fps
-    plant = plant or grow_plant(config, rng=_rng(seed, "plant"))
-    motion = move(config, plant, times, rng=_rng(seed, "motion"))
+    plant = plant or grow_plant(config, rng=stream(seed, "plant"))
+    motion = move(config, plant, times, rng=stream(seed, "motion"))
     flowers = flower_positions(plant, motion)
-    T_world_camera = camera_path(config, visited or plant, times, rng=_rng(seed, "path"))
-    hand_eye = mount_camera(config, rng=_rng(seed, "mount"))
-    leaves = grow_leaves(config, plant, times, rng=_rng(seed, "leaves"))
+    T_world_camera = camera_path(config, visited or plant, times, rng=stream(seed, "path"))
+    hand_eye = mount_camera(config, rng=stream(seed, "mount"))
+    leaves = grow_leaves(config, plant, times, rng=stream(seed, "leaves"))
     visible = visible_flowers(config, T_world_camera, flowers, leaves)
-    detections = detect(config, T_world_camera, flowers, visible, leaves, rng=_rng(seed, "detections"))
-    observations, noise = _observe(config, detections, rng=_rng(seed, "scores"))
+    detections = detect(config, T_world_camera, flowers, visible, leaves, rng=stream(seed, "detections"))
+    observations, noise = _observe(config, detections, rng=stream(seed, "scores"))
     session = Session(
         id=f"simulated-{seed}",
         stamps=np.round(_START_S + times, 6),
-        poses=measured_poses(config, T_world_camera, hand_eye, rng=_rng(seed, "poses")),
+        poses=measured_poses(config, T_world_camera, hand_eye, rng=stream(seed, "poses")),
         pose_frame=config.pose_frame,
         pose_error=config.pose_error,
         T_flange_camera=hand_eye.measured if config.pose_frame == "T_world_flange" else None,
@@ -93,10 +104,10 @@ def simulate_session(
         level=config.level,
     )
     truth = _truth(plant, T_world_camera, detections)
-    return Simulated(config, session, truth, flowers, visible, plant, motion, hand_eye, camera_of(config))
+    return Simulated(config, session, truth, flowers, visible, plant, motion, leaves, hand_eye, camera_of(config))
 
 
-def _rng(seed: int, part: str) -> np.random.Generator:
+def stream(seed: int, part: str) -> np.random.Generator:
     """One stream a part of the world, so that an option of one part does not reshuffle the others."""
     return np.random.default_rng([seed, *part.encode()])
 

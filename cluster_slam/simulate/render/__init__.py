@@ -1,0 +1,1 @@
+"""Pictures of the simulated plant: colour and depth as a small RGB-D camera would give them."""
