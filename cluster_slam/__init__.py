@@ -13,16 +13,20 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from cluster_slam.evaluation import evaluate
     from cluster_slam.io.session import open_session
+    from cluster_slam.online import OnlineTracker
     from cluster_slam.pipeline.smooth import smooth
+    from cluster_slam.pipeline.track import track
     from cluster_slam.simulate import simulate
 
 _PUBLIC = {
+    "OnlineTracker": "cluster_slam.online",
     "evaluate": "cluster_slam.evaluation",
     "open_session": "cluster_slam.io.session",
     "simulate": "cluster_slam.simulate",
     "smooth": "cluster_slam.pipeline.smooth",
+    "track": "cluster_slam.pipeline.track",
 }
-__all__ = ["__version__", "evaluate", "open_session", "simulate", "smooth"]
+__all__ = ["OnlineTracker", "__version__", "evaluate", "open_session", "simulate", "smooth", "track"]
 
 
 def __getattr__(name: str) -> Any:

@@ -173,6 +173,8 @@ class LocaliseConfig:
     n_guesses: int = 40  # of each triple; four times as many where nothing is sure yet
     n_refined: int = 12  # guesses that are refined with all that is known; five times as many where nothing is sure
     sway_m: float = 0.002  # of a cluster from rest, one sigma an axis, before the session has shown its own
+    touched_m: float = 0.02  # how far a cluster swings that was touched of late, one sigma an axis
+    sway_time_s: float = 0.3  # correlation time of sway; wrong by a factor of three is felt by few
     detection: float = 0.8  # probability that a flower in view is detected
     unmapped: float = 0.2  # share of the points that the map does not have: false ones, new flowers
 

@@ -160,6 +160,20 @@ def _drift(path: Path, session: Session) -> Drift:
     )
 
 
+def read_calibration(path: str | Path) -> Calibration:
+    """A hand-eye transform with its covariance, as ``smooth`` writes it.
+
+    Raises
+    ------
+    InputError
+        The file is missing, is no TOML, or a value is none.
+    """
+    found = _calibration(Path(path))
+    if found is None:
+        raise InputError(f"{path}: missing, expected a calibration.toml as smooth writes it")
+    return found
+
+
 def _calibration(path: Path) -> Calibration | None:
     if not path.exists():
         return None

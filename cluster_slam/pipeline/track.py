@@ -1,0 +1,108 @@
+"""Tracking of frames as they come, to be read like the method section of a paper."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter, process_time
+
+import numpy as np
+
+from cluster_slam.config import OnlineConfig
+from cluster_slam.geometry import Array
+from cluster_slam.live.replay import Replay
+from cluster_slam.online.journal import Journal
+from cluster_slam.online.journal import resume as resume_journal
+from cluster_slam.online.records import Update
+from cluster_slam.online.result import make_result
+from cluster_slam.online.tracker import OnlineTracker
+from cluster_slam.records import Calibration, Frame, Result, Session
+
+Progress = Callable[[str, float], None]
+
+
+def track(
+    session: Session,
+    *,
+    calibration: Calibration | None = None,
+    config: OnlineConfig | None = None,
+    seed: int = 0,
+    realtime: bool = False,
+    out: Path | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+    on_update: Callable[[Update], None] | None = None,
+) -> Result:
+    """Follow a session frame by frame, as if it were live: each row is what was known when its frame was processed.
+
+    Parameters
+    ----------
+    session : as ``open_session`` reads it.
+    calibration : hand-eye transform to rely on; None: estimated in the first seconds, then frozen.
+    config : the options, defaults where None.
+    seed : of what is random (K-means only).
+    realtime : at the pace of the stamps; otherwise as fast as it goes.
+    out : the journal of the run lies beside this folder, and what was tracked so far is in it at any time; None:
+        in a temporary place.
+    resume : go on from such a journal.
+    progress : called with the stage in words and a fraction 0..1.
+    on_update : called with each update.
+    """
+    say = progress or (lambda _stage, _fraction: None)
+    with tempfile.TemporaryDirectory() as temporary:
+        place = Path(temporary) / "result" if out is None else out
+        tracker, n_done = _begin(session, place, calibration, config, seed, resume)
+        begun = perf_counter()
+        with Journal(place, resume=resume) as journal:
+            journal.n_frames = n_done
+            times = np.zeros(max(session.n_frames - n_done, 0))
+            for i, frame in enumerate(_frames(session, n_done, realtime)):
+                before = process_time()
+                update = tracker.step(frame)
+                journal.write(update, tracker)
+                times[i] = process_time() - before
+                if on_update is not None:
+                    on_update(update)
+                if i % 30 == 0:
+                    say("tracking", (n_done + i) / session.n_frames)
+            result = make_result(session, tracker, journal.read(), _timings(times, perf_counter() - begun))
+        return replace(result, seed=seed)
+
+
+def _begin(
+    session: Session,
+    out: Path,
+    calibration: Calibration | None,
+    config: OnlineConfig | None,
+    seed: int,
+    resume: bool,
+) -> tuple[OnlineTracker, int]:
+    """A new tracker, or the one of the last mark, and how many frames it has taken."""
+    if resume:
+        return resume_journal(out)
+    given = calibration if session.T_flange_camera is not None else None
+    tracker = OnlineTracker(
+        session.noise,
+        session.T_flange_camera,
+        calibration=given,
+        pose_error=session.pose_error,
+        config=config,
+        seed=seed,
+    )
+    return tracker, 0
+
+
+def _frames(session: Session, n_done: int, realtime: bool) -> Iterator[Frame]:
+    frames = Replay(session, is_realtime=realtime).frames()
+    for i, frame in enumerate(frames):
+        if i >= n_done:
+            yield frame
+
+
+def _timings(times: Array, total: float) -> dict[str, float]:
+    if not len(times):
+        return {"tracking": total}
+    p50, p99 = np.percentile(times, [50, 99])
+    return {"tracking": total, "frame_p50": p50, "frame_p99": p99, "frame_longest": float(times.max())}
