@@ -26,6 +26,12 @@ def command(
     independent: Annotated[
         bool, typer.Option("--independent", help="Every frame by itself; poses.txt gives stamps only.")
     ] = False,
+    window: Annotated[
+        int | None,
+        typer.Option(
+            "--window", metavar="N", min=1, help="Each frame from the last N frames only.", show_default=False
+        ),
+    ] = None,
     config: ConfigOption = None,
     settings: SetOption = None,
     level: Annotated[
@@ -53,7 +59,7 @@ def command(
     with open_map(map_file) as store:
         plants = store.plants()
     with StageProgress(is_shown=not (quiet or as_json)) as progress:
-        found = localise(opened, plants, config=options, independent=independent, progress=progress)
+        found = localise(opened, plants, config=options, independent=independent, window=window, progress=progress)
         write_localisation(found, out)
     if as_json:
         print_json({**json.loads((out / "run.json").read_text("utf-8")), "out": str(out)})

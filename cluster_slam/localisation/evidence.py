@@ -12,7 +12,7 @@ from cluster_slam.geometry import Array, inverse, transform
 from cluster_slam.localisation.fit import LOG_2PI, Fit
 from cluster_slam.localisation.landmarks import Landmarks
 from cluster_slam.localisation.scene import ErrorScale, Look
-from cluster_slam.records import BoolArray
+from cluster_slam.records import BoolArray, IntArray
 
 _HIDDEN_SHARE = 0.2  # of the clusters in view: behind a leaf
 
@@ -25,16 +25,21 @@ def null_density(marks: Landmarks, look: Look) -> float:
 
 def log_evidence(fit: Fit, look: Look, marks: Landmarks, scale: ErrorScale) -> float:
     """Log of the ratio of likelihoods: the frame is seen from about this pose, against not of this map at all."""
-    matched = len(fit.rows)
     value, log_det = np.linalg.slogdet(fit.information)
     if value <= 0:
         return -np.inf
     pose = 0.5 * (6.0 * LOG_2PI - log_det) - np.log(_pose_volume(marks, look))
-    counted = matched * np.log(scale.detection * (1.0 - scale.unmapped))
-    counted += (len(look) - matched) * np.log(scale.unmapped)
-    return float(
-        fit.log_likelihood - _null_log_likelihood(fit, look, marks) + pose + counted + _missed(fit, look, marks, scale)
-    )
+    points = fit.log_likelihood - null_log_likelihood(fit.rows, fit.flowers, look, marks)
+    return float(points + pose + count_evidence(fit.T_map_camera, fit.rows, fit.flowers, look, marks, scale))
+
+
+def count_evidence(
+    T: Array, rows: IntArray, flowers: IntArray, look: Look, marks: Landmarks, scale: ErrorScale
+) -> float:
+    """Log of the odds of what was seen, what the map does not have, and what should have been seen and was not."""
+    counted = len(rows) * np.log(scale.detection * (1.0 - scale.unmapped))
+    counted += (len(look) - len(rows)) * np.log(scale.unmapped)
+    return float(counted + _missed(T, flowers, look, marks, scale))
 
 
 def _pose_volume(marks: Landmarks, look: Look) -> float:
@@ -44,11 +49,11 @@ def _pose_volume(marks: Landmarks, look: Look) -> float:
     return float(np.prod(extent) * 8.0 * np.pi**2)
 
 
-def _null_log_likelihood(fit: Fit, look: Look, marks: Landmarks) -> float:
+def null_log_likelihood(rows: IntArray, flowers: IntArray, look: Look, marks: Landmarks) -> float:
     """Log density of the matched points as flowers of unknown clusters (a Neyman-Scott process)."""
-    points = look.points[fit.rows]
-    group = np.searchsorted(fit.clusters, marks.cluster[fit.flowers])
-    n = len(fit.clusters)
+    points = look.points[rows]
+    clusters, group = np.unique(marks.cluster[flowers], return_inverse=True)
+    n = len(clusters)
     count = np.bincount(group, minlength=n).astype(float)
     mean = np.stack([np.bincount(group, x, n) for x in points.T], axis=1) / count[:, None]
     spread = max(marks.spread, float(look.sigma.mean()))
@@ -58,14 +63,19 @@ def _null_log_likelihood(fit: Fit, look: Look, marks: Landmarks) -> float:
     return float(members + n * np.log(n / room))
 
 
-def _missed(fit: Fit, look: Look, marks: Landmarks, scale: ErrorScale) -> float:
+def _missed(T: Array, flowers: IntArray, look: Look, marks: Landmarks, scale: ErrorScale) -> float:
     """Log probability that the flowers in view which nobody saw were missed, or hidden with their whole cluster."""
-    seen = _in_view(transform(inverse(fit.T_map_camera), marks.positions), look)
-    seen[fit.flowers] = False
+    seen = in_view_of(T, look, marks)
+    seen[flowers] = False
     missed = np.bincount(marks.cluster[seen], minlength=marks.n_clusters) * np.log(1.0 - scale.detection)
     hidden = np.full(marks.n_clusters, np.log(_HIDDEN_SHARE))
-    hidden[fit.clusters] = -np.inf
+    hidden[marks.cluster[flowers]] = -np.inf
     return float(np.where(missed < 0.0, np.maximum(missed, hidden), 0.0).sum())
+
+
+def in_view_of(T: Array, look: Look, marks: Landmarks) -> BoolArray:
+    """Which flowers of the map (f,) lie in view, as far as the frame's own points tell."""
+    return _in_view(transform(inverse(T), marks.positions), look)
 
 
 def _in_view(points: Array, look: Look) -> BoolArray:

@@ -14,7 +14,6 @@ from tracking.assignment import assign
 from tracking.gating import mahalanobis_sq, matching_log_likelihood
 
 GATE_CHI2 = 16.3  # 3 degrees of freedom: 99.9 % of true matches
-_CALM_CHI2 = 9.0  # a displacement beyond is no usual sway: it counts with less weight
 LOG_2PI = float(np.log(2.0 * np.pi))
 
 
@@ -90,7 +89,7 @@ def solve(
     rows: IntArray,
     flowers: IntArray,
     scale: ErrorScale,
-    n_iterations: int = 4,
+    n_iterations: int = 5,
     prior: Array | None = None,
 ) -> Fit:
     """The pose of least squares for given matches, each cluster's displacement eliminated (Schur complement).
@@ -101,9 +100,9 @@ def solve(
     n = len(clusters)
     points, places = look.points[rows], marks.positions[flowers]
     shared = marks.shared_covs[clusters] + scale.sway_m**2 * np.eye(3)
-    at_rest = np.linalg.solve(shared, np.broadcast_to(np.eye(3), shared.shape))
+    at_rest: Array = _inverse(shared)
     offsets = np.zeros((n, 3))
-    calm = np.ones(n)
+    tie = at_rest
     tied = np.zeros((6, 6)) if prior is None else prior
     moved = np.zeros(6)
     for _ in range(n_iterations):
@@ -112,7 +111,8 @@ def solve(
         r = places - transform(T, points)
         J = point_jacobian(R, points)
         weighted = np.linalg.solve(V, np.concatenate([J, r[..., None], np.broadcast_to(np.eye(3), V.shape)], axis=-1))
-        A = _sums(weighted[..., 7:], group, n) + calm[:, None, None] * at_rest
+        data = _sums(weighted[..., 7:], group, n)
+        A = data + tie
         B = _sums(weighted[..., :6], group, n)
         b = _sums(weighted[..., 6], group, n)
         half = np.linalg.solve(A, np.concatenate([B, b[..., None]], axis=-1))
@@ -123,26 +123,48 @@ def solve(
         T = T @ se3_exp(step)
         moved = moved + step
         offsets = -(half[..., 6] - half[..., :6] @ step)
-        d2 = np.einsum("ca,cab,cb->c", offsets, at_rest, offsets)
-        calm = np.minimum(1.0, _CALM_CHI2 / np.maximum(d2, 1e-12))
+        d2 = np.einsum("ca,cab,cb->c", offsets, tie, offsets)
+        used, tie = tie, _tie(data, b - (B @ step), shared, at_rest, scale)
     r = transform(T, points) - places - offsets[group]
     chi2 = mahalanobis_sq(r, V)
-    log_dets = (V, 1.0), (A, 1.0), (calm[:, None, None] * at_rest, -1.0)
+    log_dets = (V, 1.0), (A, 1.0), (used, -1.0)
     log_det = sum(sign * float(np.linalg.slogdet(M)[1].sum()) for M, sign in log_dets)
-    square = float(chi2.sum() + (calm * d2).sum())
-    own = np.linalg.solve(A, np.broadcast_to(np.eye(3), A.shape))
+    square = float(chi2.sum() + d2.sum())
+    own = _inverse(A)
+    by_pose = half[..., :6] @ np.linalg.solve(H + tied + ridge, np.swapaxes(half[..., :6], 1, 2))
     return Fit(
         T_map_camera=T,
         information=H + tied,
         rows=rows,
         flowers=flowers,
         offsets=offsets,
-        offset_vars=np.trace(own, axis1=1, axis2=2) / 3.0,
+        offset_vars=np.trace(own + by_pose, axis1=1, axis2=2) / 3.0,
         clusters=clusters,
         chi2=chi2,
         log_likelihood=-0.5 * (square + log_det + 3.0 * len(rows) * LOG_2PI),
-        redundancy=_redundancy(J, weighted, B, A, H + tied + ridge, group, n),
+        redundancy=_redundancy(J, weighted, B, A, data, H + tied + ridge, group, n),
     )
+
+
+def _tie(data: Array, b: Array, shared: Array, at_rest: Array, scale: ErrorScale) -> Array:
+    """Information (c, 3, 3) that ties each displacement to zero, from what the cluster's own points say of it.
+
+    Sway is a mixture of two normal distributions: most clusters hang still, a few have just been touched.
+    """
+    spread: Array = _inverse(data)
+    alone = np.linalg.solve(data, -b[..., None])[..., 0]
+    touched = shared + scale.touched_m**2 * np.eye(3)
+    log_calm = matching_log_likelihood(alone, shared + spread) + np.log1p(-scale.touched_share)
+    log_touched = matching_log_likelihood(alone, touched + spread) + np.log(scale.touched_share)
+    share = 1.0 / (1.0 + np.exp(np.clip(log_calm - log_touched, -50.0, 50.0)))[:, None, None]
+    out: Array = (1.0 - share) * at_rest + share * _inverse(touched)
+    return out
+
+
+def _inverse(covs: Array) -> Array:
+    """Inverses of a stack (c, 3, 3)."""
+    out: Array = np.linalg.solve(covs, np.broadcast_to(np.eye(3), covs.shape))
+    return out
 
 
 def _sums(values: Array, group: IntArray, n: int) -> Array:
@@ -151,9 +173,8 @@ def _sums(values: Array, group: IntArray, n: int) -> Array:
     return out
 
 
-def _redundancy(J: Array, weighted: Array, B: Array, A: Array, H: Array, group: IntArray, n: int) -> float:
+def _redundancy(J: Array, weighted: Array, B: Array, A: Array, data: Array, H: Array, group: IntArray, n: int) -> float:
     """3 m minus the degrees of freedom that pose and displacements take from the points."""
-    data = A * 0.0 + _sums(weighted[..., 7:], group, n)
     own = np.linalg.solve(A, data)
     half = np.linalg.solve(A, B)
     through = np.einsum("nia,nib->ab", J, weighted[..., :6]) - 2.0 * np.einsum("cia,cib->ab", half, B)

@@ -14,7 +14,6 @@ from cluster_slam.localisation.triples import choose_triples, matching_triples, 
 _SIDE_SIGMAS = 2.6  # a side may differ by so many standard deviations
 _FIT_SIGMAS = 3.0  # so may a point from its flower
 _MAX_FOUND = 3000  # poses that one triple may have
-_KEPT = 40  # of each triple
 _SAME_SIGMAS = 2.0  # poses that move the points by less are one
 
 
@@ -33,25 +32,28 @@ class PlantIndex:
         self.var = float(np.median(own)) / 3.0  # of a flower an axis
 
 
-def rough_poses(look: Look, index: PlantIndex, scale: ErrorScale, config: LocaliseConfig) -> tuple[Array, Array]:
-    """Distinct poses (h, 4, 4) and their scores (h,), best first."""
+def rough_poses(
+    look: Look, index: PlantIndex, scale: ErrorScale, config: LocaliseConfig, *, thorough: bool = False
+) -> tuple[Array, Array]:
+    """Distinct poses (h, 4, 4) and their scores (h,), best first; ``thorough``: all triples, and more of each."""
     var = look.sigma**2 + index.var + scale.sway_m**2
-    triples = choose_triples(look.points, np.sqrt(var), config.n_triples)
+    triples = choose_triples(look.points, np.sqrt(var), config.n_triples, 4.0 * index.marks.spread)
     poses, scores = [np.zeros((0, 4, 4))], [np.zeros(0)]
     best = 0.0
     sure = config.sure_share * len(look) * 0.6 * _FIT_SIGMAS**2 / 2.0
     for k, triple in enumerate(triples):
-        if k >= config.n_triples_sure and best >= sure:
+        if k >= config.n_triples_sure and best >= sure and not thorough:
             break
         T = _poses_of(look, index, triple, var)
         if len(T) == 0:
             continue
         score = _score(T, look, index, triple, var)
-        order = np.argsort(-score, kind="stable")[:_KEPT]
+        order = np.argsort(-score, kind="stable")[: 4 * config.n_guesses if thorough else config.n_guesses]
         poses.append(T[order])
         scores.append(score[order])
         best = max(best, float(score[order[0]]))
-    return distinct(np.concatenate(poses), np.concatenate(scores), look, float(np.sqrt(var.mean())))
+    n_max = config.n_refined * (20 if thorough else 5)
+    return distinct(np.concatenate(poses), np.concatenate(scores), look, float(np.sqrt(var.mean())), n_max)
 
 
 def _poses_of(look: Look, index: PlantIndex, triple: Array, var: Array) -> Array:
@@ -85,7 +87,7 @@ def _gain(T: Array, look: Look, index: PlantIndex, var: Array) -> Array:
     return np.asarray(np.maximum(_FIT_SIGMAS**2 - d2 / var, 0.0).sum(1) / 2.0)
 
 
-def distinct(poses: Array, scores: Array, look: Look, sigma: float, n_max: int = 60) -> tuple[Array, Array]:
+def distinct(poses: Array, scores: Array, look: Look, sigma: float, n_max: int) -> tuple[Array, Array]:
     """Poses without those that put the points where a better one puts them, best first, at most ``n_max``."""
     order = np.argsort(-scores, kind="stable")
     centre = look.points.mean(0)

@@ -90,7 +90,12 @@ class Localiser:
             raise InputError("the map holds no plant, expected at least one to localise in")
         self.config = config or LocaliseConfig()
         self.plants = tuple(p if isinstance(p, Landmarks) else landmarks_at(p, time) for p in given)
-        self.errors = ErrorScale(1.0, self.config.sway_m, self.config.detection, self.config.unmapped)
+        self.errors = ErrorScale(
+            sway_m=self.config.sway_m,
+            touched_m=self.config.touched_m,
+            detection=self.config.detection,
+            unmapped=self.config.unmapped,
+        )
         self.index = [PlantIndex(p, self._reach(p, point_sigma_m)) for p in self.plants]
 
     def _reach(self, marks: Landmarks, point_sigma_m: float) -> float:
@@ -113,19 +118,25 @@ class Localiser:
         look = make_look(points, covs, scale)
         if len(look) < 3:
             return self._answer(look, [])
-        found: list[Hypothesis] = []
-        for plant in range(len(self.plants)):
-            found += self._in_plant(look, plant, scale)
-        return self._answer(look, self._weighed(found))
+        for thorough in (False, True):
+            found: list[Hypothesis] = []
+            for plant in range(len(self.plants)):
+                found += self._in_plant(look, plant, scale, thorough)
+            weighed = self._weighed(found)
+            if weighed and weighed[0].probability >= self.config.sure_probability:
+                break
+        return self._answer(look, weighed)
 
-    def _in_plant(self, look: Look, plant: int, scale: ErrorScale) -> list[Hypothesis]:
+    def _in_plant(self, look: Look, plant: int, scale: ErrorScale, thorough: bool) -> list[Hypothesis]:
         index, marks = self.index[plant], self.plants[plant]
-        poses, scores = rough_poses(look, index, scale, self.config)
+        poses, scores = rough_poses(look, index, scale, self.config, thorough=thorough)
         if len(poses) == 0:
             return []
         var = look.sigma**2 + index.var + scale.sway_m**2
         poses, scores = sharpened(poses, look, index, var)
-        poses, scores = distinct(poses, scores, look, float(np.sqrt(var.mean())), self.config.n_refined)
+        poses, scores = distinct(
+            poses, scores, look, float(np.sqrt(var.mean())), self.config.n_refined * (5 if thorough else 1)
+        )
         density = null_density(marks, look)
         out: list[Hypothesis] = []
         for T in poses:

@@ -16,8 +16,11 @@ class ErrorScale:
 
     flower_variance: float = 1.0  # times the stated covariances of the points
     sway_m: float = 0.002  # of a cluster from rest, one sigma an axis
+    touched_share: float = 0.03  # of the clusters: touched of late, they swing ...
+    touched_m: float = 0.02  # ... about so far, one sigma an axis
     detection: float = 0.8  # probability that a flower in view is detected
     unmapped: float = 0.2  # share of the points that the map does not have: false ones, new flowers
+    pose_variance: float = 1.0  # times the stated covariances of the given poses or steps
 
 
 @dataclass(frozen=True, slots=True, eq=False)

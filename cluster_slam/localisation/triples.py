@@ -9,11 +9,14 @@ import numpy as np
 from cluster_slam.geometry import Array
 from cluster_slam.records import IntArray
 
+_LONELY = 0.3  # weight of a point that has no other near it: it may well be false
 
-def choose_triples(points: Array, sigma: Array, n_triples: int, max_points: int = 24) -> IntArray:
+
+def choose_triples(points: Array, sigma: Array, n_triples: int, near_m: float = 0.0, max_points: int = 24) -> IntArray:
     """Well-shaped, spread triples (k, 3) of points (n, 3) with errors sigma (n,), no point in too many of them.
 
     The shape of a triple is its least height over its points' errors: what its pose turns by is the inverse of that.
+    Points that have no other within ``near_m`` count less: flowers come in clusters.
     """
     n = len(points)
     if n < 3:
@@ -24,6 +27,10 @@ def choose_triples(points: Array, sigma: Array, n_triples: int, max_points: int 
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     longest = np.sqrt(np.max([((b - a) ** 2).sum(1), ((c - a) ** 2).sum(1), ((c - b) ** 2).sum(1)], axis=0))
     shape = area / np.maximum(longest, 1e-12) / np.maximum(sigma[triples].mean(1), 1e-9)
+    if near_m > 0.0:
+        apart = ((points[:, None] - points) ** 2).sum(-1)
+        lonely = (apart < near_m**2).sum(1) < 2
+        shape *= _LONELY ** lonely[triples].sum(1)
     chosen: list[int] = []
     used = np.zeros(n)
     score = shape.copy()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, replace
 from itertools import pairwise
 from time import perf_counter
 
@@ -11,9 +11,15 @@ import numpy as np
 
 from cluster_slam.config import LocaliseConfig
 from cluster_slam.localisation import Landmarks, Localisation, Localiser
+from cluster_slam.localisation.following import Follower, Place
+from cluster_slam.localisation.learning import Seen, learn_scale
+from cluster_slam.localisation.motion import Motion, motion_of
+from cluster_slam.localisation.scene import ErrorScale, Look, make_look
 from cluster_slam.records import CLUTTER, IntArray, PlantMap, PoseHypotheses, Session, SessionLocalisation
 
 Progress = Callable[[str, float], None]
+_N_LEARNING = 40  # frames from which the errors' scale is learnt, spread over the session
+_N_POSE_LEARNING = 150  # frames in a row from which the given poses' errors are learnt
 
 
 def localise(
@@ -22,6 +28,7 @@ def localise(
     *,
     config: LocaliseConfig | None = None,
     independent: bool = False,
+    window: int | None = None,
     progress: Progress | None = None,
 ) -> SessionLocalisation:
     """Where the frames of a session are in a map.
@@ -32,6 +39,7 @@ def localise(
     plants : of the map; where the session names one of them, only that is looked at.
     config : the options, defaults where None.
     independent : every frame is kidnapped; poses are not used at all.
+    window : every frame is located from so many frames that end with it, and forgets what was before. None: all.
     progress : called with the stage in words and a fraction 0..1.
 
     Raises
@@ -43,20 +51,116 @@ def localise(
     say = progress or (lambda _stage, _fraction: None)
     begin = perf_counter()
     say("reading the map", 0.0)
-    sigma = (
-        float(np.sqrt(np.trace(session.observations.covs, axis1=1, axis2=2).mean() / 3.0))
-        if len(session.observations)
-        else 0.005
+    localiser = Localiser(
+        _asked(session, plants), config, time=float(session.stamps[0]), point_sigma_m=_point_sigma(session)
     )
-    localiser = Localiser(_asked(session, plants), config, time=float(session.stamps[0]), point_sigma_m=sigma)
+    frames = _Frames(session, localiser)
     ready = perf_counter()
-    rows = _rows_of_frames(session)
-    found = []
-    for i, here in enumerate(rows):
-        say("localising", 0.05 + 0.95 * i / len(rows))
-        found.append(localiser.locate_points(session.observations.points[here], session.observations.covs[here]))
+    say("learning how large the errors are", 0.02)
+    frames.learn()
+    motion = motion_of(session)
+    if independent or window == 1:
+        places = [frames.alone(i) for i in _told(session.n_frames, say)]
+    elif window is not None:
+        places = [_from_window(frames, motion, i, window) for i in _told(session.n_frames, say)]
+    else:
+        frames.learn_poses(motion)
+        places = _followed(frames, motion, _told(session.n_frames, say))
     timings = {"map": ready - begin, "localising": perf_counter() - ready}
-    return _session_localisation(session, rows, found, config, timings)
+    return _session_localisation(session, frames, places, config, timings)
+
+
+def _told(n: int, say: Progress) -> Iterator[int]:
+    """Frame numbers, each announced."""
+    for i in range(n):
+        say("localising", 0.1 + 0.9 * i / n)
+        yield i
+
+
+class _Frames:
+    """The frames of a session, ready to be looked at; what one frame alone says is found out once."""
+
+    def __init__(self, session: Session, localiser: Localiser) -> None:
+        self.session, self.localiser = session, localiser
+        self.rows = _rows_of_frames(session)
+        self.scale = localiser.errors
+        self._found: dict[int, Localisation] = {}
+
+    def look(self, i: int, scale: ErrorScale | None = None) -> Look:
+        o, rows = self.session.observations, self.rows[i]
+        return make_look(o.points[rows], o.covs[rows], scale or self.scale)
+
+    def search(self, i: int) -> Localisation:
+        """The frame by itself, with no prior."""
+        if i not in self._found:
+            o, rows = self.session.observations, self.rows[i]
+            self._found[i] = self.localiser.locate_points(o.points[rows], o.covs[rows], scale=self.scale)
+        return self._found[i]
+
+    def learn(self) -> None:
+        """How large the errors are, from frames that are located for sure; twice, as gates follow from it."""
+        n = self.session.n_frames
+        chosen = np.unique(np.linspace(0, n - 1, min(n, _N_LEARNING)).round().astype(np.int64)).tolist()
+        for _ in range(2):
+            found = [(i, self.search(i)) for i in chosen]
+            sure = [(i, f) for i, f in found if f.is_located]
+            self._found = {}
+            if not sure:
+                return
+            seen = [
+                Seen(self.look(i), self.localiser.plants[f.hypotheses[0].plant], f.hypotheses[0].fit) for i, f in sure
+            ]
+            before = self.scale
+            self.scale = learn_scale(seen, self.scale)
+            chosen = [i for i, _ in sure]
+            if abs(np.log(self.scale.flower_variance / before.flower_variance)) < 0.3:
+                return
+
+    def learn_poses(self, motion: Motion) -> None:
+        """How large the errors of the given poses are, from a track through the first frames."""
+        n = min(self.session.n_frames, _N_POSE_LEARNING)
+        for _ in range(2):
+            follower = Follower(self.localiser, motion, self.scale, self.search, self.localiser.config.sway_time_s)
+            steps = [
+                place.step for i in range(n) if (place := follower.step(i, self.look(i))).reason == "" and place.step
+            ]
+            observed = sum(s.pose_error_sq for s in steps)
+            expected = sum(s.pose_error_sq_expected for s in steps)
+            ratio = float(np.clip((observed + 30.0) / (expected + 30.0), 0.1, 10.0))
+            self.scale = replace(self.scale, pose_variance=self.scale.pose_variance * ratio)
+            if abs(np.log(ratio)) < 0.2:
+                return
+
+    def alone(self, i: int) -> Place:
+        """Where one frame is, from itself alone."""
+        found = self.search(i)
+        best = found.hypotheses[0].fit if found.hypotheses else None
+        return Place(
+            found.reason,
+            found.plant,
+            found.probability,
+            None if best is None else best.T_map_camera,
+            None if best is None else best.cov,
+            found.flower_ids,
+            found.cluster_ids,
+            tuple((h.probability, h.fit.T_map_camera) for h in found.hypotheses),
+        )
+
+
+def _followed(frames: _Frames, motion: Motion, order: Iterable[int]) -> list[Place]:
+    """Frames one after the other: kidnapped first, then tracked."""
+    follower = Follower(frames.localiser, motion, frames.scale, frames.search, frames.localiser.config.sway_time_s)
+    return [follower.step(i, frames.look(i)) for i in order]
+
+
+def _from_window(frames: _Frames, motion: Motion, i: int, window: int) -> Place:
+    """Where a frame is, from the frames of a window that ends with it."""
+    return _followed(frames, motion, range(max(0, i - window + 1), i + 1))[-1]
+
+
+def _point_sigma(session: Session) -> float:
+    covs = session.observations.covs
+    return float(np.sqrt(np.trace(covs, axis1=1, axis2=2).mean() / 3.0)) if len(covs) else 0.005
 
 
 def _asked(session: Session, plants: Sequence[PlantMap | Landmarks]) -> Sequence[PlantMap | Landmarks]:
@@ -74,42 +178,52 @@ def _rows_of_frames(session: Session) -> list[IntArray]:
 
 
 def _session_localisation(
-    session: Session,
-    rows: list[IntArray],
-    found: list[Localisation],
-    config: LocaliseConfig,
-    timings: dict[str, float],
+    session: Session, frames: _Frames, places: list[Place], config: LocaliseConfig, timings: dict[str, float]
 ) -> SessionLocalisation:
-    n = session.n_frames
+    n, rows = session.n_frames, frames.rows
     T, covs = np.full((n, 4, 4), np.nan), np.full((n, 6, 6), np.nan)
     flowers, clusters = (np.full(len(session.observations), CLUTTER) for _ in range(2))
-    for i, here in enumerate(found):
-        if here.is_located:
-            T[i], covs[i] = here.T_map_camera, here.cov
-            flowers[rows[i]], clusters[rows[i]] = here.flower_ids, here.cluster_ids
-    warnings = () if any(f.is_located for f in found) else ("no frame was located",)
+    for i, place in enumerate(places):
+        if place.reason == "" and place.T_map_camera is not None and place.cov is not None:
+            T[i], covs[i] = place.T_map_camera, place.cov
+            flowers[rows[i]], clusters[rows[i]] = place.flower_ids, place.cluster_ids
+    warnings = () if any(p.reason == "" for p in places) else ("no frame was located",)
     return SessionLocalisation(
         session=session,
-        reasons=tuple(f.reason for f in found),
-        plants=tuple(f.plant for f in found),
-        n_inliers=np.array([len(f.hypotheses[0].fit.rows) if f.hypotheses else 0 for f in found], dtype=np.int64),
-        probability=np.array([f.probability for f in found]),
+        reasons=tuple(p.reason for p in places),
+        plants=tuple(p.plant for p in places),
+        n_inliers=np.array([p.n_inliers for p in places], dtype=np.int64),
+        probability=np.array([p.probability for p in places]),
         T_map_camera=T,
         covs=covs,
         flower_ids=flowers,
         cluster_ids=clusters,
-        hypotheses=_hypotheses(found),
+        hypotheses=_hypotheses(places),
         config=asdict(config),
         timings_s=timings,
+        estimated_noise=_noise(session, frames.scale),
         warnings=(*session.warnings, *warnings),
         status="poor" if warnings else "ok",
     )
 
 
-def _hypotheses(found: list[Localisation]) -> PoseHypotheses:
+def _noise(session: Session, scale: ErrorScale) -> dict[str, float]:
+    """The errors as learnt, by the names that sessions state them under."""
+    stated = session.noise
+    return {
+        "flower": float(np.sqrt(scale.flower_variance)) * stated.flower,
+        "pose_translation": float(np.sqrt(scale.pose_variance)) * stated.pose_translation,
+        "pose_rotation": float(np.sqrt(scale.pose_variance)) * stated.pose_rotation,
+        "sway": scale.sway_m,
+        "detection": scale.detection,
+        "unmapped": scale.unmapped,
+    }
+
+
+def _hypotheses(places: list[Place]) -> PoseHypotheses:
     """Those of the frames that have more than one."""
-    several = [(i, f) for i, f in enumerate(found) if len(f.hypotheses) > 1]
-    each = [(i, k + 1, h.probability, h.fit.T_map_camera) for i, f in several for k, h in enumerate(f.hypotheses)]
+    several = [(i, p) for i, p in enumerate(places) if len(p.hypotheses) > 1]
+    each = [(i, k + 1, *h) for i, p in several for k, h in enumerate(p.hypotheses)]
     return PoseHypotheses(
         frame=np.array([e[0] for e in each], dtype=np.int64),
         rank=np.array([e[1] for e in each], dtype=np.int64),

@@ -1,0 +1,297 @@
+"""The camera followed through a frozen map: a Kalman filter over pose, mounting and the clusters' displacements.
+
+The state holds tangents of the camera pose (z), of ``T_map_world`` (w, where the given poses are absolute) and of the
+hand-eye transform (x, where the poses are the flange's), and of each cluster met so far two displacements: one that
+stays (b: how wrong the map has it) and one that comes and goes (s: sway, an Ornstein-Uhlenbeck process). So errors that
+the flowers of a cluster share, in a frame and over frames, are counted once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from cluster_slam.geometry import Array, adjoint, inverse, se3_exp, se3_log, skew, transform
+from cluster_slam.localisation.fit import GATE_CHI2, LOG_2PI
+from cluster_slam.localisation.landmarks import Landmarks
+from cluster_slam.localisation.motion import Motion
+from cluster_slam.localisation.scene import ErrorScale, Look
+from cluster_slam.records import IntArray
+from tracking.assignment import assign
+from tracking.gating import chi2_threshold, mahalanobis_sq
+
+_DIFFUSE = np.repeat([0.3, 0.3], 3)  # rad, m: of T_map_world about a first guess, next to nothing
+_CALM_DOWN_S = 1.5  # a shaken cluster is taken to swing for about so long
+_FORGET_S = 3.0  # the sway of a cluster unseen for so long is forgotten
+
+
+@dataclass(slots=True, eq=False)
+class _Cluster:
+    at: int  # column of b in the state; s follows
+    swing_m: float = 0.0  # how far it was seen to swing of late
+    seen_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """What one frame did."""
+
+    frame: int
+    T_map_camera: Array  # (4, 4) after the frame
+    cov: Array  # (6, 6)
+    rows: IntArray  # (m,) points that are flowers of the map
+    flowers: IntArray  # (m,) which (indices of the landmarks)
+    predicted_T: Array  # (4, 4) before the frame was looked at
+    log_likelihood: float  # of the matched points, given all frames before
+    nis: float  # of all matched points together
+    pose_error_sq: float  # of the given pose or step, as estimated, squared in units of its stated covariance ...
+    pose_error_sq_expected: float  # ... and what that should be on average, were the statement true
+
+
+@dataclass(slots=True, eq=False)
+class Track:
+    """One filter. ``start`` makes it, ``step`` takes a frame."""
+
+    marks: Landmarks
+    motion: Motion
+    scale: ErrorScale
+    sway_time_s: float
+    T: Array  # (4, 4) T_map_camera
+    W: Array | None  # (4, 4) T_map_world
+    X: Array | None  # (4, 4) T_flange_camera
+    P: Array  # (d, d)
+    frame: int
+    clusters: dict[int, _Cluster] = field(default_factory=dict)
+    d: Array = field(default_factory=lambda: np.zeros(0))  # displacements, in the order of the state after the poses
+
+    @property
+    def n_poses(self) -> int:
+        """Entries of the state before the displacements."""
+        return 6 + (6 if self.W is not None else 0) + (6 if self.X is not None else 0)
+
+    @property
+    def pose_cov(self) -> Array:
+        return self.P[:6, :6]
+
+    def predict(self, frame: int) -> Array:
+        """Move the state to another frame; the covariance (6, 6) that the given motion adds to the camera pose."""
+        dt = abs(float(self.motion.stamps[frame] - self.motion.stamps[self.frame]))
+        self._let_sway(dt, float(self.motion.stamps[frame]))
+        F, added = self._pose_transition(frame)
+        n = len(self.P)
+        top = F @ self.P[: F.shape[1]]
+        self.P[:6] = top
+        self.P[:, :6] = np.vstack([top[:, : F.shape[1]] @ F.T, top[:, 6:].T]) if n > 6 else top @ F.T
+        self.P[:6, :6] = 0.5 * (self.P[:6, :6] + self.P[:6, :6].T) + added
+        self.frame = frame
+        return added
+
+    def _pose_transition(self, frame: int) -> tuple[Array, Array]:
+        """Rows (6, n_poses) that the new camera tangent has of the old pose state, and what is added to its covariance.
+
+        Moves ``T`` too. Absolute poses: T = W F Exp(e) X. Odometry: T' = T X^-1 (F^-1 F') Exp(e) X.
+        """
+        F = np.zeros((6, self.n_poses))
+        motion, X = self.motion, self.X
+        lever = np.eye(6) if X is None else adjoint(inverse(X))
+        at_x = 6 if self.W is None else 12
+        if self.W is not None:
+            seen = motion.camera_in_world(frame, X)
+            self.T = self.W @ seen
+            F[:, 6:12] = adjoint(inverse(seen))
+            if X is not None:
+                F[:, at_x : at_x + 6] = np.eye(6)
+            cov = motion.cov * self.scale.pose_variance
+        else:
+            moved = motion.camera_step(self.frame, frame, X)
+            self.T = self.T @ moved
+            F[:, :6] = adjoint(inverse(moved))
+            if X is not None:
+                F[:, at_x : at_x + 6] = np.eye(6) - F[:, :6]
+            cov = motion.step_cov(self.frame, frame) * self.scale.pose_variance
+        return F, lever @ cov @ lever.T
+
+    def _let_sway(self, dt: float, now: float) -> None:
+        gone = []
+        for cluster, c in self.clusters.items():
+            c.swing_m *= float(np.exp(-dt / _CALM_DOWN_S))
+            s = slice(c.at + 3, c.at + 6)
+            if now - c.seen_s > _FORGET_S and c.swing_m > 0:
+                gone.append(cluster)
+            time = self.sway_time_s if c.swing_m < 2.0 * self.scale.sway_m else 0.3 * self.sway_time_s
+            keep = float(np.exp(-dt / time))
+            self.P[s] *= keep
+            self.P[:, s] *= keep
+            self.d[c.at + 3 - self.n_poses : c.at + 6 - self.n_poses] *= keep
+            self.P[s, s] += (1.0 - keep**2) * (self.scale.sway_m**2 + c.swing_m**2) * np.eye(3)
+        for cluster in gone:
+            self.clusters[cluster].swing_m = 0.0
+
+    def _meet(self, cluster: int) -> _Cluster:
+        """The cluster's place in the state, made where it is new."""
+        if cluster not in self.clusters:
+            at = len(self.P)
+            grown = np.zeros((at + 6, at + 6))
+            grown[:at, :at] = self.P
+            grown[at : at + 3, at : at + 3] = self.marks.shared_covs[cluster]
+            grown[at + 3 :, at + 3 :] = self.scale.sway_m**2 * np.eye(3)
+            self.P = grown
+            self.d = np.concatenate([self.d, np.zeros(6)])
+            self.clusters[cluster] = _Cluster(at)
+        return self.clusters[cluster]
+
+    def displacement(self, cluster: int) -> Array:
+        """Where the cluster stands from its place in the map (3,), m, as far as is known."""
+        if cluster not in self.clusters:
+            return np.zeros(3)
+        at = self.clusters[cluster].at - self.n_poses
+        return self.d[at : at + 3] + self.d[at + 3 : at + 6]
+
+    def associate(self, look: Look, null_density: float) -> tuple[IntArray, IntArray]:
+        """Points and flowers matched one to one, as predicted."""
+        seen = transform(self.T, look.points)
+        R = self.T[:3, :3]
+        J = np.concatenate([-R @ skew(look.points), np.broadcast_to(R, (len(look), 3, 3))], axis=-1)
+        point_cov = R @ look.covs @ R.T + J @ self.pose_cov @ np.swapaxes(J, 1, 2)
+        places, covs = self._places()
+        largest = np.trace(point_cov, axis1=1, axis2=2).max() + np.trace(covs, axis1=1, axis2=2)
+        off = seen[:, None] - places
+        i, j = np.nonzero((off**2).sum(-1) < GATE_CHI2 * largest)
+        if len(i) == 0:
+            return i, j
+        S = point_cov[i] + covs[j]
+        d2 = mahalanobis_sq(off[i, j], S)
+        cost = np.full((len(look), len(places)), np.inf)
+        log_det = np.linalg.slogdet(S)[1]
+        cost[i, j] = np.where(d2 < GATE_CHI2, 0.5 * (d2 + log_det + 3.0 * LOG_2PI), np.inf)
+        near = np.flatnonzero(np.isfinite(cost).any(0))
+        rows, columns = assign(cost[:, near], -float(np.log(null_density)))
+        return rows, near[columns]
+
+    def _places(self) -> tuple[Array, Array]:
+        """Predicted places (f, 3) of all flowers, and their covariances (f, 3, 3)."""
+        shift = np.zeros((self.marks.n_clusters, 3))
+        shared = self.marks.shared_covs + self.scale.sway_m**2 * np.eye(3)
+        for cluster, c in self.clusters.items():
+            b, s = slice(c.at, c.at + 3), slice(c.at + 3, c.at + 6)
+            shift[cluster] = self.displacement(cluster)
+            shared[cluster] = self.P[b, b] + self.P[s, s] + self.P[b, s] + self.P[s, b]
+        return self.marks.positions + shift[self.marks.cluster], self.marks.covs + shared[self.marks.cluster]
+
+    def update(self, look: Look, rows: IntArray, flowers: IntArray, n_iterations: int = 1) -> tuple[float, float]:
+        """Take the matched points in; log likelihood and chi-square of their innovations."""
+        for cluster in np.unique(self.marks.cluster[flowers]).tolist():
+            self._meet(cluster).seen_s = float(self.motion.stamps[self.frame])
+        T0, W0, X0, d0, P0 = self.T, self.W, self.X, self.d, self.P
+        moved = np.zeros(len(self.P))
+        log_likelihood = nis = 0.0
+        for iteration in range(n_iterations):
+            H, r, V = self._linearised(look, rows, flowers)
+            innovation = r + H @ moved
+            PH = P0 @ H.T
+            S = H @ PH + V
+            if iteration == 0:
+                self._shake(S, innovation, flowers, P0)
+                PH = P0 @ H.T
+                S = H @ PH + V
+            L = np.linalg.cholesky(S)
+            white = np.linalg.solve(L, np.column_stack([innovation, PH.T]))
+            moved = white[:, 1:].T @ white[:, 0]
+            if iteration == 0:
+                nis = float(white[:, 0] @ white[:, 0])
+                log_likelihood = -0.5 * nis - float(np.log(np.diag(L)).sum()) - 0.5 * len(r) * LOG_2PI
+            self._move(T0, W0, X0, d0, moved)
+        self.P = P0 - white[:, 1:].T @ white[:, 1:]
+        self.P = 0.5 * (self.P + self.P.T)
+        for cluster in np.unique(self.marks.cluster[flowers]).tolist():
+            c = self.clusters[cluster]
+            at = c.at + 3 - self.n_poses
+            c.swing_m = max(c.swing_m, float(np.linalg.norm(self.d[at : at + 3])) - 2.0 * self.scale.sway_m, 0.0)
+        return log_likelihood, nis
+
+    def _shake(self, S: Array, innovation: Array, flowers: IntArray, P: Array) -> None:
+        """Clusters whose points are off together have been shaken: their sway may be anything (P grows in place)."""
+        cluster = np.repeat(self.marks.cluster[flowers], 3)
+        for one in np.unique(cluster).tolist():
+            here = np.flatnonzero(cluster == one)
+            r = innovation[here]
+            if r @ np.linalg.solve(S[np.ix_(here, here)], r) > chi2_threshold(len(here), 0.9995):
+                c = self.clusters[one]
+                c.swing_m = max(c.swing_m, 0.5 * self.scale.touched_m)
+                P[range(c.at + 3, c.at + 6), range(c.at + 3, c.at + 6)] += self.scale.touched_m**2
+
+    def _linearised(self, look: Look, rows: IntArray, flowers: IntArray) -> tuple[Array, Array, Array]:
+        """Jacobian (3 m, d), residuals (3 m,) and covariance (3 m, 3 m) of the matched points in the camera frame."""
+        m, Rt = len(rows), self.T[:3, :3].T
+        of = self.marks.cluster[flowers]
+        at = np.array([self.clusters[c].at for c in of.tolist()])
+        places = self.marks.positions[flowers] + np.array([self.displacement(c) for c in of.tolist()])
+        h = transform(inverse(self.T), places)
+        H = np.zeros((m, 3, len(self.P)))
+        H[:, :, :6] = np.concatenate([skew(h), np.broadcast_to(-np.eye(3), (m, 3, 3))], axis=-1)
+        k, axis = np.arange(m)[:, None, None], np.arange(3)[:, None]
+        H[k, axis, at[:, None, None] + np.arange(3)] = Rt
+        H[k, axis, at[:, None, None] + 3 + np.arange(3)] = Rt
+        V = np.zeros((m, 3, m, 3))
+        V[np.arange(m), :, np.arange(m)] = look.covs[rows] + Rt @ self.marks.covs[flowers] @ Rt.T
+        return H.reshape(3 * m, -1), (look.points[rows] - h).ravel(), V.reshape(3 * m, 3 * m)
+
+    def _move(self, T: Array, W: Array | None, X: Array | None, d: Array, moved: Array) -> None:
+        self.T = T @ se3_exp(moved[:6])
+        at = 6
+        if W is not None:
+            self.W = W @ se3_exp(moved[at : at + 6])
+            at += 6
+        if X is not None:
+            self.X = X @ se3_exp(moved[at : at + 6])
+            at += 6
+        self.d = d + moved[at:]
+
+    def step(self, frame: int, look: Look, null_density: float) -> Step:
+        """Take the next frame in."""
+        added = self.predict(frame)
+        predicted, before = self.T, self.pose_cov.copy()
+        rows, flowers = self.associate(look, null_density) if len(look) else (np.zeros(0, np.int64),) * 2
+        log_likelihood, nis = self.update(look, rows, flowers) if len(rows) else (0.0, 0.0)
+        after = self.pose_cov.copy()
+        surprise = _pose_surprise(added, before, after, se3_log(inverse(predicted) @ self.T))
+        return Step(frame, self.T, after, rows, flowers, predicted, log_likelihood, nis, *surprise)
+
+
+def _pose_surprise(added: Array, before: Array, after: Array, moved: Array) -> tuple[float, float]:
+    """The given pose's own error as the frame shows it: its square over its covariance, and what to expect of that.
+
+    ``added`` (6, 6) is the error's covariance, part of ``before``, the predicted pose's; ``after`` is the posterior's.
+    """
+    gain = np.linalg.solve(before, added).T
+    error = gain @ moved
+    information = np.linalg.solve(added, np.eye(6))
+    expected = np.trace(information @ gain @ (before - after) @ gain.T)
+    return float(error @ information @ error), float(expected)
+
+
+def start(
+    marks: Landmarks,
+    motion: Motion,
+    frame: int,
+    T_map_camera: Array,
+    scale: ErrorScale,
+    sway_time_s: float,
+) -> Track:
+    """A track that begins at a frame near a pose, about which next to nothing is believed yet."""
+    X = motion.X0
+    W = None if motion.is_odometry else T_map_camera @ inverse(motion.camera_in_world(frame, X))
+    n = 6 + (0 if W is None else 6) + (0 if X is None else 6)
+    P = np.zeros((n, n))
+    about = np.diag(_DIFFUSE**2)
+    if X is not None:
+        P[n - 6 :, n - 6 :] = motion.cov_hand_eye
+    if W is None:
+        P[:6, :6] = about
+    else:  # the pose of the first frame is what is vague; T_map_world follows from it
+        P[6:12, 6:12] = adjoint(motion.camera_in_world(frame, X)) @ about @ adjoint(motion.camera_in_world(frame, X)).T
+    track = Track(marks, motion, scale, sway_time_s, T_map_camera, W, X, P, frame)
+    if W is not None:
+        track.predict(frame)
+    return track
