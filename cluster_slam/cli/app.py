@@ -18,6 +18,7 @@ from cluster_slam.cli import (
     detect,
     evaluate,
     figures,
+    importing,
     localise,
     record,
     reproduce,
@@ -72,6 +73,7 @@ app.command("figures")(figures.command)
 app.command("compare-descriptors")(compare.command)
 app.command("localise")(localise.command)
 app.command("record")(record.command)
+app.command("import")(importing.command)
 app.command("rtde-emulator")(rtde_emulator.command)
 app.add_typer(reproduce.app, name="reproduce")
 app.add_typer(map_commands.app, name="map")

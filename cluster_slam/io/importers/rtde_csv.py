@@ -6,7 +6,7 @@ column ``time`` may hold the date of the host that wrote the log.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +20,7 @@ from cluster_slam.sensors.rtde.fields import type_of
 from cluster_slam.sensors.rtde.wire import N_VALUES
 
 _DATES = ("%Y:%m:%d:%H:%M:%S.%f", "%Y-%m-%d %H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S.%f", "%Y-%m-%d %H:%M:%S")
+_MIN_UNIX, _MAX_UNIX = 1e8, 1e11  # s; other numbers are no Unix time
 _MAX_BAD = 0.01  # of the rows: more that cannot be read, and it is no log
 
 
@@ -86,7 +87,7 @@ def read_rtde_csv(path: Path) -> RtdeLog:
         raise InputError(f"{path}: row {whole[k][0]}: {text}, expected a later one (did the controller restart?)")
     if not keep.all():
         warnings.append(f"{path}: {(~keep).sum()} rows repeat the stamp before them and are left out")
-    host = _dates(path, header, whole)
+    host = _dates(header, whole)
     columns = {name: values[keep] for name, values in _vectors(numbers).items()}
     return RtdeLog(path, stamps[keep], columns, None if host is None else host[keep], tuple(warnings))
 
@@ -140,17 +141,28 @@ def _vectors(numbers: dict[str, Array]) -> dict[str, Array]:
     return out
 
 
-def _dates(path: Path, header: list[str], rows: Sequence[tuple[int, list[str]]]) -> Array | None:
-    """Unix time (n,) of the column ``time``: a date is taken for UTC, a number for seconds."""
-    if "time" not in header:
-        return None
-    k = header.index("time")
-    cells = [cells[k] for _, cells in rows]
-    if all(_is_finite(cell) for cell in cells):
-        return np.array([float(cell) for cell in cells])
-    for pattern in _DATES:
-        try:
-            return np.array([datetime.strptime(cell, pattern).replace(tzinfo=UTC).timestamp() for cell in cells])
-        except ValueError:
-            continue
-    raise InputError(f"{path}: row {rows[0][0]}: time is {shown(cells[0])}, expected a date or seconds")
+def _dates(header: list[str], rows: Sequence[tuple[int, list[str]]]) -> Array | None:
+    """Unix time (n,) of the column ``time``: a date is taken for UTC, a number for seconds.
+
+    Some loggers write the date under ``_id``, beside a count under ``time``.
+    """
+    for name in ("time", "_id"):
+        if name in header:
+            cells = [cells[header.index(name)] for _, cells in rows]
+            for read in (_seconds, *map(_date_reader, _DATES)):
+                try:
+                    return np.array([read(cell) for cell in cells])
+                except ValueError:
+                    continue
+    return None
+
+
+def _seconds(cell: str) -> float:
+    seconds = float(cell)
+    if not _MIN_UNIX < seconds < _MAX_UNIX:
+        raise ValueError
+    return seconds
+
+
+def _date_reader(pattern: str) -> Callable[[str], float]:
+    return lambda cell: datetime.strptime(cell, pattern).replace(tzinfo=UTC).timestamp()
