@@ -285,6 +285,7 @@ class PlantMap:
     viewpoint: Array | None = None  # (3,) mean camera position over the sessions, map
     last_session: float = float("nan")  # s, end of the latest session
     drift_rate: float = 0.003  # m/day, RMS norm of the drift of a cluster, as learned so far
+    walk_rate: float = 0.0007  # m/sqrt(day), one sigma an axis of a cluster's random walk, as learned so far
 
     @property
     def flower_rows(self) -> IntArray:

@@ -37,7 +37,7 @@ def at(plant: PlantMap, time: float, config: GrowthConfig | None = None) -> Plan
     days = np.abs(dt) / DAY_S
     passed = dt != 0.0
     cross = plant.position_velocity_covs + np.swapaxes(plant.position_velocity_covs, 1, 2)
-    walk_sq = config.walk_m_per_sqrt_day**2 * days + config.setting_m**2 * passed
+    walk_sq = plant.walk_rate**2 * days + config.setting_m**2 * passed
     covs = plant.cluster_covs + cross * dt[:, None, None] + plant.velocity_covs * (dt**2)[:, None, None]
     covs = covs + walk_sq[:, None, None] * np.eye(3)
     clusters = plant.clusters + plant.velocities * dt[:, None]

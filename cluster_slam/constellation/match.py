@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import betaln
 
 from cluster_slam.config import GrowthConfig, MatchConfig
 from cluster_slam.constellation.explain import Explained, Scene, explain, matched_pairs, refine
@@ -13,7 +14,7 @@ from cluster_slam.constellation.growth import DAY_S
 from cluster_slam.constellation.plane import Space, spaces
 from cluster_slam.constellation.poses import Places, best_distinct, guess_poses, quick_scores
 from cluster_slam.constellation.units import Units, background_of, log_volume, plant_units, session_units
-from cluster_slam.constellation.warp import warped
+from cluster_slam.constellation.warp import field_log_density, warped
 from cluster_slam.geometry import Array
 from cluster_slam.records import Constellation, PlantMap
 
@@ -86,13 +87,13 @@ def match(
             continue
         explained, again = _search(scene)
         repeated |= again
-        candidates += [_Candidate(space, scene, e, _evidence(scene, e, single), single) for e in explained]
+        candidates += [_Candidate(space, scene, e, _evidence(scene, e, single=single), single) for e in explained]
     if not candidates:
         return Match(plant.name, 0.0, -np.inf, -np.inf, False)
     best = max(candidates, key=lambda c: c.evidence)
     others = [c.evidence for c in candidates if _says_something_else(best, c)]
     name, runner_up = plant.name, max(others, default=-np.inf)
-    found = _found(session, alive, best, growth, similarity)
+    found = _found(session, alive, best, similarity)
     return Match(name, best.found.log_ratio, best.evidence, runner_up, repeated, found)
 
 
@@ -169,7 +170,7 @@ def _search(scene: Scene) -> tuple[list[Explained], bool]:
     return sorted(refined, key=lambda e: -e.log_ratio), repeated
 
 
-def _evidence(scene: Scene, found: Explained, single: bool) -> float:
+def _evidence(scene: Scene, found: Explained, *, single: bool) -> float:
     """Log likelihood ratio with the pose integrated out (Laplace): the peak times its volume over the prior's.
 
     The prior is uniform over all turns and over places where the session overlaps the plant.
@@ -189,21 +190,32 @@ def _evidence(scene: Scene, found: Explained, single: bool) -> float:
         size = np.sqrt(((pairs.a - pairs.a.mean(0)) ** 2).sum() * len(pairs.a) / max(pairs.n_units, 1) / len(pairs.a))
         sigma = np.sqrt(float(np.median(pairs.var_offset + pairs.variance.mean())) / max(pairs.n_units, 1)) / size
         occam += min(0.0, np.log(2.5 * sigma / (scene.scale_range[1] - scene.scale_range[0])))
-    torn = _torn(scene, found) if single else 0.0
-    return float(found.log_ratio + min(occam, 0.0) + torn)
+    ratio = _single_ratio(scene, found) if single else found.log_ratio
+    return float(ratio + min(occam, 0.0) + _shares(scene, found))
 
 
-def _torn(scene: Scene, found: Explained) -> float:
-    """What flowers cost that were matched one by one and left others of their cluster alone.
+def _single_ratio(scene: Scene, found: Explained) -> float:
+    """Log likelihood ratio of flowers that were matched one by one: each drifts for itself, or all in a smooth field.
 
-    Cluster by cluster, the missing and the new are part of a pair's score; this makes the two comparable.
+    What is seen and what is new is left to :func:`_shares`.
     """
-    known = scene.known
-    touched = np.isin(known.cluster, known.cluster[found.known])
-    touched[found.known] = False
-    missing = np.log1p(-known.seen[touched, 0]).sum()
-    fresh = np.isin(scene.query.cluster, scene.query.cluster[found.query])
-    return float(missing + (fresh.sum() - len(found)) * np.log(scene.background.n_new))
+    seen = np.clip(scene.known.seen[found.known, 0], 1e-3, 0.999)
+    alone = found.log_ratio + len(found) * scene.background.n_new - float(np.log(seen).sum())
+    strangers = len(found) * scene.background.log_group_density + float(scene.bonus[found.query].sum())
+    together = field_log_density(scene, found) - strangers
+    return float(np.logaddexp(alone, together) - np.log(2.0))
+
+
+def _shares(scene: Scene, found: Explained) -> float:
+    """What it costs that only some units found a partner, the shares of either side being unknown.
+
+    With a share theta ~ Beta(a, 1), m certain ones of n have the probability B(m + a, n - m + 1) / B(a, 1).
+    """
+    m = len(found)
+    still_there = 1.0 - np.prod(1.0 - np.where(scene.known.groups.mask, scene.known.seen, 0.0), axis=1)
+    n_known = max(float(m), float(still_there.sum()) / scene.config.seen_share)
+    sides = ((float(len(scene.query)), 2.0), (min(n_known, float(len(scene.known))), 4.0))
+    return float(sum(betaln(m + a, n - m + 1.0) - betaln(a, 1.0) for n, a in sides))
 
 
 def _in_three(pairs: Pairs) -> Pairs:
@@ -228,18 +240,16 @@ def _flower_pairs(candidate: _Candidate) -> set[tuple[int, int]]:
     return set(zip(a.tolist(), b.tolist(), strict=True))
 
 
-def _drifted(plant: PlantMap, days: float, growth: GrowthConfig) -> float:
+def _drifted(plant: PlantMap, days: float) -> float:
     """Variance along each axis of a cluster's drift since the plant's first session.
 
     What the clusters of a plant drifted in common cannot be told from a base that stands elsewhere, however often they
     were seen between: the transform to the frame of the first session is only as sure as their mean drift.
     """
-    return plant.drift_rate**2 * days**2 / 3.0 + growth.walk_m_per_sqrt_day**2 * abs(days)
+    return plant.drift_rate**2 * days**2 / 3.0 + plant.walk_rate**2 * abs(days)
 
 
-def _found(
-    session: Constellation, alive: PlantMap, best: _Candidate, growth: GrowthConfig, similarity: bool
-) -> Found | None:
+def _found(session: Constellation, alive: PlantMap, best: _Candidate, similarity: bool) -> Found | None:
     scene, found = best.scene, best.found
     if best.single:
         scene, found = warped(scene, found)
@@ -250,7 +260,7 @@ def _found(
     a = session.flowers[scene.query.flower[found.query[row], member]]
     pairs = replace(matched_pairs(scene, found), a=a, b=a)
     since = float(np.nan_to_num(session.start - np.fmin.reduce(alive.cluster_first_seen, initial=np.nan))) / DAY_S
-    pairs = replace(pairs, var_offset=np.maximum(pairs.var_offset, _drifted(alive, since, growth)))
+    pairs = replace(pairs, var_offset=np.maximum(pairs.var_offset, _drifted(alive, since)))
     cov = pose_covariance(pairs, scale, with_scale=similarity)
     return Found(
         alive, best.space.to_map(pose.R[0], pose.t[0], scale), scale, cov, best.space, scene, found, best.single

@@ -16,7 +16,7 @@ def is_flat(points: Array, sigma: float) -> bool:
     """Whether points (n, 3) lie in one plane, as far as their sigma lets one see."""
     if len(points) < 3:
         return False
-    spread = np.sqrt(np.linalg.eigvalsh(np.cov(points.T)))
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(points.T)), 0.0))
     return bool(spread[0] < max(FLAT_SIGMAS * sigma, FLAT_SHARE * spread[2]))
 
 

@@ -16,7 +16,7 @@ from cluster_slam.geometry import Array
 from tracking.reid import Groups
 
 LENGTH_SHARE = 0.35  # correlation length over the plant's spread (RMS distance from its middle)
-SIZES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # drift against what was expected
+SIZES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # drift against what was expected: a factor of two is one sigma
 SHARES = (0.0, 0.5, 0.9)  # of its variance that is common to neighbours
 N_ROUNDS = 3
 
@@ -36,16 +36,39 @@ def warped(scene: Scene, found: Explained) -> tuple[Scene, Explained]:
     return best_scene, best
 
 
+def field_log_density(scene: Scene, found: Explained) -> float:
+    """Log density of the matched flowers' drift as a smooth field, its size and share summed over with their prior."""
+    pairs = matched_pairs(scene, found)
+    at, residual = pairs.b, found.pose.apply(pairs.a)[0] - pairs.b
+    var, noise, length = pairs.var_offset[pairs.unit], pairs.variance, _length(scene)
+    sizes = np.array(SIZES)
+    prior = -0.5 * np.log2(sizes) ** 2
+    prior = prior - np.logaddexp.reduce(prior) - np.log(len(SHARES))
+    each = [
+        _log_evidence(at, residual, var, noise, length, s, c) + p
+        for s, p in zip(sizes.tolist(), prior.tolist(), strict=True)
+        for c in SHARES
+    ]
+    return float(np.logaddexp.reduce(each) - 0.5 * residual.size * np.log(2 * np.pi))
+
+
+def _length(scene: Scene) -> float:
+    """Correlation length of the field, m."""
+    spread = np.sqrt(((scene.known.centres - scene.known.centres.mean(0)) ** 2).sum(1).mean())
+    return max(LENGTH_SHARE * float(spread), 1e-3)
+
+
 def _moved(scene: Scene, found: Explained) -> Scene:
     """Known units where the matched ones say they are."""
     pairs = matched_pairs(scene, found)
     at, residual = pairs.b, found.pose.apply(pairs.a)[0] - pairs.b
-    spread = np.sqrt(((scene.known.centres - scene.known.centres.mean(0)) ** 2).sum(1).mean())
-    length = max(LENGTH_SHARE * float(spread), 1e-3)
+    length = _length(scene)
     var = pairs.var_offset[pairs.unit]
     size, share = max(
         ((s, c) for s in SIZES for c in SHARES),
-        key=lambda x: _log_evidence(at, residual, var, pairs.variance, length, *x),
+        key=lambda x: (
+            _log_evidence(at, residual, var, pairs.variance, length, x[0], x[1]) - 0.5 * float(np.log2(x[0])) ** 2
+        ),
     )
     field, left = _predict(
         scene.known.centres, scene.known.var_offset, at, residual, var, pairs.variance, length, size, share
@@ -69,8 +92,7 @@ def _log_evidence(
     K += np.diag(noise + size**2 * (1 - share) * var)
     _, log_det = np.linalg.slogdet(K)
     fitted = float((residual * np.linalg.solve(K, residual)).sum())
-    prior = -0.5 * (np.log(size) / np.log(2.0)) ** 2  # the expected size is the likeliest; a factor of two is one sigma
-    return float(-0.5 * fitted - 0.5 * residual.shape[1] * log_det + prior)
+    return float(-0.5 * fitted - 0.5 * residual.shape[1] * log_det)
 
 
 def _predict(

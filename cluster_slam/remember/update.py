@@ -14,7 +14,8 @@ from cluster_slam.geometry import Array, rotate_cov, transform
 from cluster_slam.records import BoolArray, Constellation, IntArray, PlantMap
 from tracking.presence import after_group_miss, after_miss, any_present, persisted
 
-PRIOR_CLUSTERS = 4.0  # the prior of the drift's size counts as so many clusters
+PRIOR_CLUSTERS = 4.0  # the priors of drift and walk count as so many clusters
+N_ROUNDS = 8  # of expectation maximisation
 _CLUSTER = (
     *("cluster_ids", "clusters", "cluster_covs", "cluster_time", "velocities", "velocity_covs"),
     *("position_velocity_covs", "growth_rates", "growth_vars", "n_flowers", "descriptors", "descriptor_covs"),
@@ -61,7 +62,7 @@ def empty_plant(name: str, config: GrowthConfig) -> PlantMap:
     ids = {n: np.zeros(0, dtype=np.int64) for n in (*_CLUSTER, *_FLOWER) if n.endswith("_ids") or n == "n_flowers"}
     rest = {n: np.zeros(0) for n in (*_CLUSTER, *_FLOWER) if n not in none and n not in ids}
     values: dict[str, Any] = {**none, **ids, **rest}
-    return PlantMap(name=name, drift_rate=config.drift_m_per_day, **values)
+    return PlantMap(name=name, drift_rate=config.drift_m_per_day, walk_rate=config.walk_m_per_sqrt_day, **values)
 
 
 def update(
@@ -93,10 +94,24 @@ def update(
     kept.follow_clusters()
     kept.look(looked)
     kept.learn_growth()
-    after = replace(kept.result(), drift_rate=kept.learn_drift())
+    after = replace(kept.result(), drift_rate=kept.learn_drift(), walk_rate=kept.walk_rate)
     grown, cluster_ids, flower_ids = _with_new(after, session, where, who, config, now, next_cluster, next_flower)
     missed = plant.cluster_ids[kept.missed]
     return Updated(_summarised(grown), cluster_ids, flower_ids, missed)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shift:
+    """A cluster that was seen again, k of its flowers, and how far they are from where they were expected."""
+
+    cluster: int  # row of the plant
+    members: IntArray  # rows of all its flowers
+    found: IntArray  # (k,) rows of those that were seen
+    theirs: IntArray  # (k,) rows of the session's flowers
+    residual: Array  # (k, 3)
+    weight: Array  # (k,)
+    mean: Array  # (3,)
+    cov: Array  # (3, 3) of the mean, without what the flowers share
 
 
 class _Work:
@@ -123,24 +138,60 @@ class _Work:
         self.partner[who.flower[found]] = found
         self.seen = np.zeros(len(plant.cluster_ids), dtype=bool)
         self.missed = np.zeros(len(plant.cluster_ids), dtype=bool)
+        self.walk_rate = plant.walk_rate
         self.measured: dict[int, tuple[float, float]] = {}  # growth rate of a cluster, and its variance
 
     def follow_clusters(self) -> None:
         """Each cluster of which flowers were seen again is moved to where they are, and its drift is learned."""
-        for c in np.unique(self.row[self.partner >= 0]).tolist():
-            members = np.flatnonzero(self.row == c)
-            self.seen[c] = True
-            self._follow(c, members, members[self.partner[members] >= 0])
+        again = np.unique(self.row[self.partner >= 0])
+        self.seen[again] = True
+        shifts = [self._shift(c) for c in again.tolist()]
+        self.walk_rate = self._learn_walk(again, shifts)
+        for shift in shifts:
+            self._follow(shift)
 
-    def _follow(self, c: int, members: IntArray, found: IntArray) -> None:
-        v, moved = self.values, self.moved
+    def _shift(self, c: int) -> _Shift:
+        """How far a cluster's flowers are from where they were expected."""
+        members = np.flatnonzero(self.row == c)
+        found = members[self.partner[members] >= 0]
         theirs = self.partner[found]
-        residual = self.where.flowers[theirs] - moved.flowers[found]
-        own = moved.flower_covs[found] + self.where.covs[theirs]
+        residual = self.where.flowers[theirs] - self.moved.flowers[found]
+        own = self.moved.flower_covs[found] + self.where.covs[theirs]
         weight = 1.0 / (np.trace(own, axis1=1, axis2=2) / 3.0)
-        mean = weight @ residual / weight.sum()
         R = np.einsum("k,kij->ij", weight**2, own) / weight.sum() ** 2
-        P = moved.cluster_covs[c]
+        return _Shift(c, members, found, theirs, residual, weight, weight @ residual / weight.sum(), R)
+
+    def _learn_walk(self, rows: IntArray, shifts: list[_Shift]) -> float:
+        """Random walk of the clusters, m/sqrt(day): what steady drift does not explain (expectation maximisation)."""
+        days = np.abs(self.dt[rows]) / DAY_S
+        used = np.flatnonzero(days > 0.25)
+        prior = self.plant.walk_rate
+        if len(used) < 4:
+            return prior
+        means = np.array([shifts[k].mean for k in used.tolist()])
+        squared = ((means - np.median(means, axis=0)) ** 2).sum(1) / 3.0
+        noise = np.array([np.trace(shifts[k].cov) / 3.0 for k in used.tolist()])
+        total = np.trace(self.moved.cluster_covs[rows[used]], axis1=1, axis2=2) / 3.0 + noise
+        rest, days, rate_sq = total - prior**2 * days[used], days[used], prior**2
+        for _ in range(N_ROUNDS):
+            own = rate_sq * days
+            share = own / (rest + own)
+            walked = (share**2 * np.minimum(squared, 9.0 * total) + own * (1.0 - share)) / days
+            rate_sq = (PRIOR_CLUSTERS * prior**2 + float(walked.sum())) / (PRIOR_CLUSTERS + len(used))
+        return float(np.sqrt(rate_sq))
+
+    def _follow(self, shift: _Shift) -> None:
+        v, moved, c = self.values, self.moved, shift.cluster
+        members, found, theirs, residual, weight = (
+            shift.members,
+            shift.found,
+            shift.theirs,
+            shift.residual,
+            shift.weight,
+        )
+        mean, R = shift.mean, shift.cov
+        walked = (self.walk_rate**2 - self.plant.walk_rate**2) * abs(self.dt[c]) / DAY_S
+        P = moved.cluster_covs[c] + walked * np.eye(3)
         nis = float(mean @ np.linalg.solve(P + R, mean)) / 3.0
         inflate = max(1.0, nis)  # it moved farther than was thought possible: its drift is less known than was thought
         P, C, V = (inflate * m for m in (P, moved.position_velocity_covs[c], moved.velocity_covs[c]))

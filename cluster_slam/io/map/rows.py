@@ -51,6 +51,7 @@ def plant_from_rows(plant: Row, clusters: Sequence[Row], flowers: Sequence[Row],
         viewpoint=viewpoint,
         last_session=float("nan") if last is None else last,
         drift_rate=plant[5],
+        walk_rate=plant[6],
     )
 
 

@@ -20,7 +20,8 @@ TABLES = f"""
 CREATE TABLE plants (
   id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE,
   view_x REAL, view_y REAL, view_z REAL,  -- mean camera position, map
-  drift_rate REAL NOT NULL                -- m/day, RMS norm
+  drift_rate REAL NOT NULL,               -- m/day, RMS norm
+  walk_rate REAL NOT NULL                 -- m/sqrt(day), one sigma an axis
 );
 CREATE TABLE sessions (
   id INTEGER PRIMARY KEY, session TEXT NOT NULL UNIQUE, plant_id INTEGER NOT NULL REFERENCES plants(id),

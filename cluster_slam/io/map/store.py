@@ -95,7 +95,9 @@ class MapStore:
         InputError
             There is none of this name.
         """
-        found = self.read("SELECT id, name, view_x, view_y, view_z, drift_rate FROM plants WHERE name = ?", (name,))
+        found = self.read(
+            "SELECT id, name, view_x, view_y, view_z, drift_rate, walk_rate FROM plants WHERE name = ?", (name,)
+        )
         if not found:
             known = ", ".join(self.plant_names()[:10]) or "none"
             raise InputError(f"{self.path}: no plant {name!r}, it has: {known}")

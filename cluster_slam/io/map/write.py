@@ -71,12 +71,17 @@ def _plant(connection: sqlite3.Connection, entry: Entry) -> tuple[int, Row | Non
     view: list[float | None] = [None] * 3 if entry.viewpoint is None else entry.viewpoint.tolist()
     if before is None:
         new_id = connection.execute("SELECT coalesce(max(id), 0) + 1 FROM plants").fetchone()[0]
-        values = (new_id, entry.plant.name, *view, entry.plant.drift_rate)
-        connection.execute("INSERT INTO plants VALUES (?, ?, ?, ?, ?, ?)", values)
+        values = (new_id, entry.plant.name, *view, entry.plant.drift_rate, entry.plant.walk_rate)
+        connection.execute("INSERT INTO plants VALUES (?, ?, ?, ?, ?, ?, ?)", values)
         return int(new_id), None
-    values = (*view, entry.plant.drift_rate, before[0])
-    connection.execute("UPDATE plants SET view_x=?, view_y=?, view_z=?, drift_rate=? WHERE id=?", values)
+    _set_plant(connection, (*before[:2], *view, entry.plant.drift_rate, entry.plant.walk_rate))
     return int(before[0]), before
+
+
+def _set_plant(connection: sqlite3.Connection, row: Row) -> None:
+    """Write a row of ``plants`` over the one of its id."""
+    names = "view_x=?, view_y=?, view_z=?, drift_rate=?, walk_rate=?"
+    connection.execute(f"UPDATE plants SET {names} WHERE id=?", (*row[2:], row[0]))
 
 
 def _changed(connection: sqlite3.Connection, plant: PlantMap, plant_id: int) -> dict[str, tuple[list[Row], list[Row]]]:
@@ -185,10 +190,7 @@ def undo(store: MapStore) -> StoredSession:
         if journal["plant"] is None:
             connection.execute("DELETE FROM plants WHERE name = ?", (last.plant,))
         else:
-            row = journal["plant"]
-            connection.execute(
-                "UPDATE plants SET view_x=?, view_y=?, view_z=?, drift_rate=? WHERE id=?", (*row[2:], row[0])
-            )
+            _set_plant(connection, tuple(journal["plant"]))
     return last
 
 
