@@ -55,4 +55,7 @@ def open_detector(
         raise ConfigError(f"unknown detector {name!r} (known: {', '.join(NAMES)}, or a model's file)")
     if name == "colour":
         return ColourDetector() if score is None else ColourDetector(min_score=score)
-    raise ConfigError("models are not yet read: take --detector colour")
+    from cluster_slam.detect.onnx import open_onnx, own_model
+
+    path = own_model() if model is None else Path(model)
+    return open_onnx(path, prompt=prompt, score=score, provider=provider, threads=threads)

@@ -43,7 +43,7 @@ def add_flower(
         lift = cup + rng.normal(0.0, 0.16)
         e1 = radius * rng.normal(1.0, 0.04) * (np.cos(lift) * out_dir + np.sin(lift) * normal)
         roll = rng.normal(0.0, 0.12)
-        e2 = radius * 5.2 / n_petals * (np.cos(roll) * side + np.sin(roll) * normal)
+        e2 = radius * 4.7 / n_petals * (np.cos(roll) * side + np.sin(roll) * normal)
         origin = middle + rng.normal(0.0, 0.0002) * normal
         tint = colour * rng.normal(1.0, 0.05)
         part(origin, e1, e2, petal(rng), tint, texture=Texture.PETAL, translucency=0.25)

@@ -90,7 +90,8 @@ def _is_lit(shadows: Shadows, facets: Facets, kept: Placed, painted: Painted) ->
     row = np.clip(v, 0, height - 1).astype(np.int32)
     own = np.append(facets.things[kept.index], -1).astype(np.int32)[flat]
     first = shadows.thing[row, column]
-    lit: NDArray[np.bool_] = ((first == own) | (first < 0)).reshape(painted.z.shape)
+    far = np.append(facets.textures[kept.index] == Texture.BACKDROP, True)[flat]  # its light is its own
+    lit: NDArray[np.bool_] = ((first == own) | (first < 0) | far).reshape(painted.z.shape)
     return lit
 
 

@@ -35,6 +35,7 @@ def build_scene(config: SimulateConfig, plant: Plant, leaves: Leaves, *, rng: np
     out = Builder()
     stem_rng, leaf_rng, flower_rng, other_rng, light_rng = rng.spawn(5)
     _backdrop(out, config, plant, other_rng)
+    _behind(out, config, plant, other_rng)
     _stems(out, config, plant, stem_rng)
     _foliage(out, config, plant, leaf_rng)
     _front_leaves(out, plant, leaves, leaf_rng)
@@ -80,6 +81,22 @@ def _backdrop(out: Builder, config: SimulateConfig, plant: Plant, rng: np.random
                 texture=Texture.BACKDROP,
                 thing=thing,
             )
+
+
+def _behind(out: Builder, config: SimulateConfig, plant: Plant, rng: np.random.Generator) -> None:
+    """Dim leaves between the plant and the backdrop: the row does not end with one plant."""
+    low, high = plant.stems.min((0, 1)), plant.stems.max((0, 1))
+    s = config.scale
+    n = round(60 * float(np.ptp(plant.stems[..., 0])) / s * min(1.0, config.look.foliage_per_m / 20.0))
+    for _ in range(n):
+        place = rng.uniform(low, high)
+        place[1] = high[1] + s * rng.uniform(0.0, 0.15)
+        if _hides(place, 0.05 * s, plant.flowers):
+            continue
+        way, normal = rng.normal(size=3), np.array([0.0, -1.0, 0.6]) + rng.normal(0, 0.5, 3)
+        way -= way @ normal * normal / (normal @ normal)
+        size = s * rng.uniform(0.05, 0.12)
+        _leaflet(out, place, way / np.linalg.norm(way), normal, size, 0.55 * _green(rng), out.thing(), rng)
 
 
 def _stems(out: Builder, config: SimulateConfig, plant: Plant, rng: np.random.Generator) -> None:

@@ -19,12 +19,13 @@ SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 
 def petal(rng: np.random.Generator) -> Array:
-    """An outline (10, 2) of a petal, no two alike: s 0 at the flower's centre, 1 at the tip; t from -0.5 to 0.5."""
+    """An outline (11, 2) of a petal, no two alike: s 0 at the flower's centre, 1 at the tip; t from -0.5 to 0.5."""
     s = _PETAL_S + rng.normal(0.0, 0.015, 5)
     left, right = _PETAL_T * rng.normal(1.0, 0.06, (2, 5))
     outward = np.column_stack([s, -left])
     back = np.column_stack([s + rng.normal(0.0, 0.02, 5), right])[::-1]
-    return np.concatenate([outward, back])
+    notch = np.array([[0.95 + rng.normal(0.0, 0.03), rng.normal(0.0, 0.03)]])
+    return np.concatenate([outward, notch, back])
 
 
 def half_leaf(rng: np.random.Generator) -> Array:

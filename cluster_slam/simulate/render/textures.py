@@ -74,6 +74,6 @@ def _stamens(s: Array, t: Array, rng: np.random.Generator) -> Array:
 
 def _backdrop(rng: np.random.Generator) -> Array:
     """Leaves, gaps and light far behind, out of focus."""
-    value = np.exp(0.45 * clouds(rng, 10) + 0.2 * clouds(rng, 24))
-    tint = clouds(rng, 8)
+    value = np.exp(0.4 * clouds(rng, 5) + 0.12 * clouds(rng, 12))
+    tint = clouds(rng, 4)
     return np.stack([value * (1 - 0.12 * tint), value, value * (1 + 0.12 * tint)], axis=-1) * 0.9

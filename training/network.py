@@ -1,0 +1,87 @@
+"""The detector's network: depthwise-separable, boxes at a quarter of the picture's size."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+STRIDE = 4
+WIDTHS = (12, 24, 48, 64)
+
+
+def _conv(a: int, b: int, kernel: int, stride: int = 1, groups: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(a, b, kernel, stride, kernel // 2, groups=groups, bias=False), nn.BatchNorm2d(b), nn.ReLU()
+    )
+
+
+class Block(nn.Module):
+    """Depthwise, then pointwise; with a shortcut where the shape stays."""
+
+    def __init__(self, a: int, b: int, kernel: int = 3, stride: int = 1) -> None:
+        super().__init__()
+        self.deep = _conv(a, a, kernel, stride, groups=a)
+        self.wide = _conv(a, b, 1)
+        self.is_same = a == b and stride == 1
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.wide(self.deep(x))
+        return x + y if self.is_same else y
+
+
+class FlowerNet(nn.Module):
+    """Per cell: a flower's middle (logit), its offset in cells, log width and height in cells."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        a, b, c, d = WIDTHS
+        self.at2 = _conv(3, a, 3, 2)
+        self.at4 = nn.Sequential(Block(a, b, 3, 2), Block(b, b))
+        self.at8 = nn.Sequential(Block(b, c, 3, 2), Block(c, c), Block(c, c), Block(c, c))
+        self.at16 = nn.Sequential(Block(c, d, 3, 2), Block(d, d, 5), Block(d, d, 5))
+        self.up16 = _conv(d, c, 1)
+        self.mix8 = Block(c, c)
+        self.up8 = _conv(c, b, 1)
+        self.mix4 = nn.Sequential(Block(b, b, 5), Block(b, b))
+        self.head = nn.Conv2d(b, 5, 1)
+        nn.init.constant_(self.head.bias, 0.0)
+        with torch.no_grad():
+            self.head.bias[0] = -4.0
+            self.head.bias[3:] = 1.2
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(n, 3, h, w) in 0..1 to (n, 5, h / 4, w / 4)."""
+        x4 = self.at4(self.at2(x * 4.0 - 2.0))
+        x8 = self.at8(x4)
+        x16 = self.at16(x8)
+        x8 = self.mix8(x8 + nn.functional.interpolate(self.up16(x16), scale_factor=2.0, mode="nearest"))
+        x4 = self.mix4(x4 + nn.functional.interpolate(self.up8(x8), scale_factor=2.0, mode="nearest"))
+        return self.head(x4)
+
+
+class Exported(nn.Module):
+    """The network with the outputs of a YOLOv8 export: (1, 5, cells) of cx, cy, w, h in pixels and the score.
+
+    A cell that is not the best of its 3 x 3 neighbours has score 0; the best takes the neighbours' boxes into its own.
+    """
+
+    def __init__(self, net: FlowerNet) -> None:
+        super().__init__()
+        self.net = net
+
+    def forward(self, images: Tensor) -> Tensor:
+        raw = self.net(images)
+        score = torch.sigmoid(raw[:, :1])
+        n_rows, n_columns = raw.shape[2], raw.shape[3]
+        x = torch.arange(n_columns, dtype=raw.dtype).view(1, 1, 1, -1) + 0.5
+        y = torch.arange(n_rows, dtype=raw.dtype).view(1, 1, -1, 1) + 0.5
+        middle = torch.cat([raw[:, 1:2] + x, raw[:, 2:3] + y], 1)
+        size = torch.exp(torch.clamp(raw[:, 3:], -2.0, 5.0))
+        boxes = torch.cat([middle, size], 1)
+        weight = score * score
+        mean = nn.functional.avg_pool2d(torch.cat([boxes * weight, weight], 1), 3, 1, 1)
+        boxes = mean[:, :4] / (mean[:, 4:] + 1e-9) * STRIDE
+        boxes = torch.cat([boxes[:, :2] - 0.5, boxes[:, 2:]], 1)  # pixel centres at whole numbers
+        peak = nn.functional.max_pool2d(score, 3, 1, 1)
+        kept = torch.where(score >= peak, score, torch.zeros_like(score))
+        return torch.cat([boxes, kept], 1).flatten(2)
