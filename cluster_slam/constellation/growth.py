@@ -36,11 +36,16 @@ def at(plant: PlantMap, time: float, config: GrowthConfig | None = None) -> Plan
     dt = gaps(plant, time)
     days = np.abs(dt) / DAY_S
     passed = dt != 0.0
+    memory = config.memory_days * DAY_S
+    kept = np.exp(-np.abs(dt) / memory)  # of the velocity
+    path = np.sign(dt) * memory * (1.0 - kept)  # s: how far today's velocity leads
+    prior = (plant.drift_rate / DAY_S) ** 2 / 3.0
+    spread = prior * _wander(np.abs(dt), memory)
     cross = plant.position_velocity_covs + np.swapaxes(plant.position_velocity_covs, 1, 2)
     walk_sq = plant.walk_rate**2 * days + config.setting_m**2 * passed
-    covs = plant.cluster_covs + cross * dt[:, None, None] + plant.velocity_covs * (dt**2)[:, None, None]
-    covs = covs + walk_sq[:, None, None] * np.eye(3)
-    clusters = plant.clusters + plant.velocities * dt[:, None]
+    covs = plant.cluster_covs + cross * path[:, None, None] + plant.velocity_covs * (path**2)[:, None, None]
+    covs = covs + (walk_sq + spread)[:, None, None] * np.eye(3)
+    clusters = plant.clusters + plant.velocities * path[:, None]
     row = plant.flower_rows
     size = np.exp(plant.growth_rates * dt)[row]
     offsets = plant.flowers - plant.clusters[row]
@@ -51,10 +56,25 @@ def at(plant: PlantMap, time: float, config: GrowthConfig | None = None) -> Plan
         clusters=clusters,
         cluster_covs=0.5 * (covs + np.swapaxes(covs, 1, 2)),
         cluster_time=np.where(np.isnan(time), plant.cluster_time, np.full(len(dt), time)),
-        position_velocity_covs=plant.position_velocity_covs + plant.velocity_covs * dt[:, None, None],
+        velocities=plant.velocities * kept[:, None],
+        velocity_covs=plant.velocity_covs * (kept**2)[:, None, None]
+        + (prior * (1.0 - kept**2))[:, None, None] * np.eye(3),
+        position_velocity_covs=kept[:, None, None]
+        * (plant.position_velocity_covs + plant.velocity_covs * path[:, None, None])
+        + (prior * np.sign(dt) * memory * (1.0 - kept) ** 2)[:, None, None] * np.eye(3),
         flowers=clusters[row] + size[:, None] * offsets,
         flower_covs=plant.flower_covs + flower_walk[:, None, None] * np.eye(3) + radial,
     )
+
+
+def _wander(dt: Array, memory: float) -> Array:
+    """Variance of the position after a time dt of an Ornstein-Uhlenbeck velocity of unit variance that began at zero.
+
+    2 T dt - 3 T^2 + 4 T^2 e - T^2 e^2 with e = exp(-dt / T) (Gillespie 1996, eq. 2.14).
+    """
+    e = np.exp(-dt / memory)
+    var: Array = memory * (2.0 * dt - memory * (3.0 - 4.0 * e + e * e))
+    return np.maximum(var, 0.0)
 
 
 def gaps(plant: PlantMap, time: float) -> Array:
