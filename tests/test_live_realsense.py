@@ -28,18 +28,20 @@ def intrinsics() -> Any:
 class Device:
     """A camera whose depth is ``baseline`` metres to the side of its colour; 0: one imager for both, as in a D405."""
 
-    def __init__(self, baseline: float = 0.0) -> None:
+    def __init__(self, baseline: float = 0.0, *, start: bool = True) -> None:
         self.device = rs.software_device()
         self.sensors = [self.device.add_sensor("Depth"), self.device.add_sensor("Color")]
         self.profiles = [
             self.sensors[0].add_video_stream(self._stream(rs.stream.depth, 0, 2, rs.format.z16)),
             self.sensors[1].add_video_stream(self._stream(rs.stream.color, 1, 3, rs.format.bgr8)),
         ]
+        self.sensors[0].add_read_only_option(rs.option.depth_units, SCALE)
+        if not start:
+            return
         extrinsics = rs.extrinsics()
         extrinsics.rotation = [1.0, 0, 0, 0, 1, 0, 0, 0, 1]
         extrinsics.translation = [baseline, 0.0, 0.0]
         self.profiles[0].register_extrinsics_to(self.profiles[1], extrinsics)
-        self.sensors[0].add_read_only_option(rs.option.depth_units, SCALE)
         self.syncer = rs.syncer()
         self.device.create_matcher(rs.matchers.dlr_c)
         for sensor, profile in zip(self.sensors, self.profiles, strict=True):

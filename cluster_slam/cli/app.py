@@ -17,6 +17,7 @@ from cluster_slam.cli import (
     compare,
     detect,
     evaluate,
+    exporting,
     figures,
     importing,
     localise,
@@ -74,6 +75,7 @@ app.command("compare-descriptors")(compare.command)
 app.command("localise")(localise.command)
 app.command("record")(record.command)
 app.command("import")(importing.command)
+app.command("export")(exporting.command)
 app.command("rtde-emulator")(rtde_emulator.command)
 app.add_typer(reproduce.app, name="reproduce")
 app.add_typer(map_commands.app, name="map")

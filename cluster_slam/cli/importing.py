@@ -143,16 +143,12 @@ def _dry_run(source: Path, options: ImportOptions, quiet: bool, as_json: bool) -
         print_json({"format": words, "streams": listed, "warnings": warnings})
     elif not quiet:
         print_warnings(warnings)
-        print_table(f"{source}: {words}", [(s.name, _words(s.kind, s.n, s.role)) for s in streams])
+        print_table(f"{source}: {words}", [(s.role, f"{s.name}: {s.n} of {s.kind}") for s in streams])
     return 0 if is_ready else 1
 
 
 def _known(seconds: float) -> float | None:
     return seconds if seconds == seconds else None
-
-
-def _words(kind: str, n: int, role: str) -> str:
-    return f"{n} of {kind}" + (f"  -> {role}" if role else "")
 
 
 def _streams(imported: Imported) -> list[dict[str, Any]]:

@@ -39,17 +39,18 @@ def read_bag(path: Path, options: ImportOptions) -> Imported:
         chosen = _choose(bag, options)
         warnings: list[str] = []
         frame, frame_stamps, colour_offset, colour_clock = _colour(bag, chosen, warnings)
+        if not frame and "flowers" in chosen:
+            cloud_stamps, _, frame = bag.stamps(chosen["flowers"])
+            frame_stamps = np.unique(cloud_stamps)
         camera = _camera(bag, chosen, options)
-        head, stamps, rows = _poses(bag, chosen, options, frame, frame_stamps, warnings)
+        head, stamps, rows, words = _poses(bag, chosen, options, frame, frame_stamps, warnings)
         flowers = flower_rows(bag, chosen["flowers"]) if "flowers" in chosen else None
         scale = options.depth_scale or ros_realsense.depth_scale(bag) or _scale_of(bag, chosen.get("depth"))
         register = None
         if camera is not None and "depth" in chosen and "colour" in chosen:
             register = ros_realsense.registration(bag, chosen["colour"], chosen["depth"], camera, scale)
         depth_offset, depth_clock = _clock_of(bag, chosen["depth"], []) if "depth" in chosen else (_SAME, None)
-        streams = tuple(replace(s, role=_role(chosen, s.name)) for s in bag.streams())
-    if frame_stamps is None and flowers is not None:
-        frame_stamps = np.unique(flowers.stamps)
+        streams = tuple(replace(s, role=_role(chosen, s.name) or _tf_role(s, words)) for s in bag.streams())
     return Imported(
         "ROS 1 bag" if path.suffix == ".bag" else "ROS 2 bag",
         streams,
@@ -71,6 +72,10 @@ def bag_streams(path: Path, options: ImportOptions) -> list[Stream]:
     with Bag(path) as bag:
         chosen = _choose(bag, options)
         return [replace(s, role=_role(chosen, s.name)) for s in bag.streams()]
+
+
+def _tf_role(stream: Stream, words: str) -> str:
+    return words if stream.kind == TF and "static" not in stream.name else ""
 
 
 def _role(chosen: dict[str, str], topic: str) -> str:
@@ -173,21 +178,21 @@ def _poses(
     frame: str,
     frame_stamps: Array | None,
     warnings: list[str],
-) -> tuple[SessionHead, Array, Array]:
-    """What ``session.toml`` says of the poses, their stamps (p,) and rows (p, 7)."""
+) -> tuple[SessionHead, Array, Array, str]:
+    """What ``session.toml`` says of the poses, their stamps (p,) and rows (p, 7), and what tf is used for, in words."""
     head = SessionHead(options.id or bag.path.stem, options.plant, source=f"imported from {bag.path.name}")
     if options.is_still:
         stamps = np.unique(frame_stamps) if frame_stamps is not None else np.zeros(0)
-        return head, stamps, np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(stamps), 1))
+        return head, stamps, np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(stamps), 1)), ""
     if options.poses_file is not None:
         stamps, rows, pose_frame, more = read_pose_file(options.poses_file, options.time_offset_s)
         warnings += more
-        return _with_frame(head, options, pose_frame, None), stamps, rows
+        return _with_frame(head, options, pose_frame, None), stamps, rows, ""
     tf = _from_tf(bag, options, frame)
     if tf is not None and (options.pose is None or ">" in options.pose):
         stamps, rows, pose_frame, hand_eye, error, words = tf
-        warnings.append(words)
-        return _with_frame(replace(head, pose_error=error), options, pose_frame, hand_eye), stamps, rows
+        chosen.pop("pose", None)
+        return _with_frame(replace(head, pose_error=error), options, pose_frame, hand_eye), stamps, rows, words
     if "pose" not in chosen:
         expected = "expected tf to the camera's frame, a pose topic, --poses FILE or --still"
         raise InputError(f"{bag.path}: no poses in {len(bag.streams())} topics, {expected}")
@@ -195,7 +200,8 @@ def _poses(
     stamps, rows = _from_topic(bag, topic, warnings)
     guess: PoseFrame = "T_world_flange" if "tcp" in topic.lower() else "T_world_camera"
     odometry: PoseError = "odometry" if "Odometry" in bag.kind(topic) else "absolute"
-    return _with_frame(replace(head, pose_error=odometry), options, guess, None), stamps + options.time_offset_s, rows
+    head = _with_frame(replace(head, pose_error=odometry), options, guess, None)
+    return head, stamps + options.time_offset_s, rows, ""
 
 
 def _with_frame(head: SessionHead, options: ImportOptions, guess: PoseFrame, hand_eye: Array | None) -> SessionHead:
@@ -232,7 +238,7 @@ def _from_tf(
     hand_eye = tree.static(frame, path.frame) if is_flange and frame in tree.edges else None
     error: PoseError = "odometry" if path.root in ODOMETRY else "absolute"
     pose_frame: PoseFrame = "T_world_flange" if is_flange else "T_world_camera"
-    words = f"poses are those of {path.frame} in {path.root}, from tf"
+    words = f"pose ({path.frame} in {path.root})"
     return path.stamps + options.time_offset_s, path.rows, pose_frame, hand_eye, error, words
 
 

@@ -25,7 +25,7 @@ POSES = (
     "nav_msgs/msg/Odometry",
 )
 POINTS = "sensor_msgs/msg/PointCloud2"
-_NANO = 1e9  # nanoseconds in a second
+_NANO = 10**9  # nanoseconds in a second; whole numbers, so that a quotient is rounded once
 
 
 def is_bag(path: Path) -> bool:
@@ -37,7 +37,7 @@ def is_bag(path: Path) -> bool:
 
 def seconds(stamp: Any) -> float:
     """A ROS time as seconds."""
-    return float(stamp.sec) + float(stamp.nanosec) / _NANO
+    return (int(stamp.sec) * _NANO + int(stamp.nanosec)) / _NANO
 
 
 class Bag:
@@ -140,7 +140,7 @@ class Bag:
         order, at = ("<" if raw[1] & 1 else ">", 4) if self._reader.is2 else ("<", 4)  # encapsulation; sequence number
         sec, nano, n = struct.unpack_from(f"{order}iII", raw, at)
         name = bytes(raw[at + 12 : at + 12 + n]).rstrip(b"\0").decode("utf-8", "replace")
-        return sec + nano / _NANO, name
+        return (sec * _NANO + nano) / _NANO, name
 
 
 def _broken(path: Path, error: Exception, topic: str = "") -> InputError:

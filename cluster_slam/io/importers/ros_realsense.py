@@ -50,7 +50,7 @@ def depth_scale(bag: Bag) -> float | None:
     for topic in bag.topics([_STRING, _FLOAT]):
         if topic.endswith("/option/Depth_Units/value"):
             for _, _, message in bag.messages([topic]):
-                return float(f"{float(message.data):.6g}")
+                return float(f"{float(message.data):.7g}")
     return None
 
 
