@@ -17,13 +17,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from cluster_slam.association.displacement import presence_of
-from cluster_slam.association.frames import Frames, chi2_and_log_det
+from cluster_slam.association.frames import Frames, chi2_and_log_det, view_volume
 from cluster_slam.geometry import Array, rotate_cov, transform
 from cluster_slam.records import BoolArray, IntArray
 
 WILD = 5.0  # a wild error's sigma over the usual one
-_NEAR = 3.0 * WILD  # sigmas within which wild errors lie ...
+_NEAR = 4.0 * WILD  # sigmas within which wild errors lie ...
 _FAR = 2.0 * _NEAR  # ... and within which the shell around them lies
+_SURE = 3.0  # log-likelihood ratio of a claim, 95 %: a flower that is missed costs less than a false one
 _LOG_2PI = float(np.log(2.0 * np.pi))
 
 
@@ -66,7 +67,8 @@ def claim_wild(
     n_missed, candidates = _near_missed(frames, T, places, cluster, landmark, moved, known)
     if n_missed == 0 or len(candidates.row) == 0:
         return landmark, WildErrors(0.0, 1.0)
-    errors = _wild_errors(candidates, n_missed, int((landmark >= 0).sum()))
+    everywhere = max(int((landmark < 0).sum()), 1) / frames.n_frames / view_volume(frames)
+    errors = _wild_errors(candidates, n_missed, int((landmark >= 0).sum()), everywhere)
     if errors.share <= 0.0:
         return landmark, errors
     ratio = errors.log_ratio(candidates.chi2, candidates.log_det)
@@ -74,7 +76,7 @@ def claim_wild(
     taken: set[tuple[int, int]] = set()
     for i in np.argsort(-ratio, kind="stable"):
         row, flower = int(candidates.row[i]), int(candidates.flower[i])
-        if ratio[i] <= 0.0:
+        if ratio[i] <= _SURE:
             break
         key = (int(frames.frame[row]), flower)
         if out[row] < 0 and key not in taken:
@@ -113,16 +115,21 @@ def _near_missed(
     return n_missed, _Candidates(row, flower, chi2, log_det)
 
 
-def _wild_errors(candidates: _Candidates, n_missed: int, n_matched: int) -> WildErrors:
-    """Density of false detections from the shell about missed flowers; what is nearer in excess of it is wild."""
+def _wild_errors(candidates: _Candidates, n_missed: int, n_matched: int, everywhere: float) -> WildErrors:
+    """Density of false detections from the shell about missed flowers; what is nearer in excess of it is wild.
+
+    The density ``everywhere``, 1 / m^3, counts as one detection in the shell.
+    """
     unit = 4.0 / 3.0 * np.pi * float(np.exp(0.5 * np.median(candidates.log_det)))  # m^3 within one sigma
-    near = int((candidates.chi2 < _NEAR**2).sum())
-    shell = int(((candidates.chi2 >= _NEAR**2) & (candidates.chi2 < _FAR**2)).sum())
-    density = (shell + 1.0) / (n_missed * unit * (_FAR**3 - _NEAR**3))
+    nearest = np.full(int(candidates.row.max()) + 1, np.inf)
+    np.minimum.at(nearest, candidates.row, candidates.chi2)
+    near = int((nearest < _NEAR**2).sum())
+    shell = int(((nearest[candidates.row] >= _NEAR**2) & (candidates.chi2 < _FAR**2)).sum())
+    density = (shell + 1.0) / (n_missed * unit * (_FAR**3 - _NEAR**3) + 1.0 / everywhere)
     expected = density * n_missed * unit * _NEAR**3
     excess = near - expected
     share = excess / (n_matched + excess) if excess > 3.0 * np.sqrt(expected + 1.0) else 0.0
-    return WildErrors(float(share), float(density))
+    return WildErrors(float(min(share, 0.5)), float(density))
 
 
 def let_go(landmark: IntArray, chi2: Array, frames: Frames, errors: WildErrors, least_share: float) -> IntArray:

@@ -25,6 +25,7 @@ from cluster_slam.records import BoolArray
 _WINDOW_S = 0.4  # motion hardly changes for so long
 _SIGNIFICANT = 11.3  # chi-square, 3 degrees of freedom, 99 %
 _FEWEST_FRAMES = 5
+_SYSTEMATIC = 0.02  # of an observation's variance: how well places at rest are known, which does not average out
 _SURE = 0.33  # motion of three times its own standard deviation is there at all
 _APART = (0.95, 0.35)  # ratio of flowers of two clusters, mean and sigma ...
 _ANYTHING = 0.05  # ... and this share of all pairs has any ratio
@@ -101,7 +102,7 @@ def _ratios(pairs: NDArray[Any], motion: Motion) -> tuple[Array, Array]:
         total = float((weight * ((u_f**2).sum(-1) + (u_g**2).sum(-1))).sum()) - bias
         if total > 0.0:
             ratio[i] = apart / total
-            sigma[i] = np.sqrt(6.0 * float(((weight * noise) ** 2).sum())) / total
+            sigma[i] = np.hypot(np.sqrt(6.0 * float(((weight * noise) ** 2).sum())), _SYSTEMATIC * bias) / total
     return ratio, sigma
 
 

@@ -59,6 +59,8 @@ def group_flowers(
         return _numbered(fcluster(tree, config.linkage_m, "distance"))
     likelihood = Likelihood(places, view_volume, spacing, evidence)
     label = likeliest_cut(tree, likelihood)
+    likelihood.knowing(len(np.unique(label)))
+    label = likeliest_cut(tree, likelihood)
     if config.method == "spacing":
         label = improve(label, likelihood)
     return _numbered(label) if _come_in_clusters(places, presence, label) else np.arange(n)

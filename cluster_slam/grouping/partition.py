@@ -1,8 +1,8 @@
 """The likeliest partition of flowers into clusters, from where they stand and from what their motion says.
 
 Clusters stand anywhere in the space that was looked at; members scatter about their centroid with one sigma for all
-clusters; the number of members is Poisson. To this comes the evidence of each pair within a cluster; of the pairs
-among n members only n - 1 say something new, so each counts 2 / n.
+clusters; the number of members is Poisson, and some flowers are loose. To this comes the evidence of each pair within a
+cluster; of the pairs among n members only n - 1 say something new, so each counts 2 / n.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from cluster_slam.records import IntArray
 
 _NEIGHBOURS = 6  # whose clusters a flower may move to
 _MAX_SWEEPS = 10
+_FEW = 3.0  # clusters
 
 
 class Likelihood:
@@ -27,13 +28,20 @@ class Likelihood:
         """``volume`` m^3 that was looked at, ``spacing`` m to the nearest flower, ``evidence`` (l, l) of motion."""
         sides = np.ptp(places, axis=0)
         self.places = places
-        self.volume = max(float(np.prod(np.maximum(sides, 0.1 * sides.max()))), volume)
+        self.box = float(np.prod(np.maximum(sides, 0.1 * sides.max())))
+        self.view = volume
+        self.log_volume = float(np.log(max(self.box, volume)))
         self.prior_sigma = 0.7 * spacing
         pairs = None if evidence is None else evidence.tocoo()
         keep = np.empty(0, dtype=bool) if pairs is None else pairs.row < pairs.col
         self.row = np.empty(0, dtype=np.int64) if pairs is None else pairs.row[keep].astype(np.int64)
         self.col = np.empty(0, dtype=np.int64) if pairs is None else pairs.col[keep].astype(np.int64)
         self.evidence = np.empty(0) if pairs is None else pairs.data[keep]
+
+    def knowing(self, n_clusters: int) -> None:
+        """Take the flowers' own extent for that of the plant, as far as so many clusters tell it."""
+        few, c = _FEW * np.log(self.view), n_clusters * np.log(self.box)
+        self.log_volume = float((few + c) / (_FEW + n_clusters))
 
     def __call__(self, label: IntArray) -> float:
         """Of the clusters that ``label`` (l,) names with any integers."""
@@ -48,13 +56,23 @@ class Likelihood:
         dof = 3.0 * (n - c)
         var = (square + 3.0 * prior_weight * self.prior_sigma**2) / (dof + 3.0 * prior_weight)
         scatter = -0.5 * dof * np.log(2.0 * np.pi * var) - 0.5 * square / var - 1.5 * np.log(size).sum()
-        mean = n / c
-        members = (size * np.log(mean) - mean - gammaln(size + 1.0)).sum()
-        return float(scatter - c * np.log(self.volume) + members)
+        return float(scatter - c * self.log_volume + _log_sizes(size))
 
     def _motion(self, label: IntArray, size: IntArray) -> float:
         within = label[self.row] == label[self.col]
         return float((self.evidence[within] * 2.0 / size[label[self.row[within]]]).sum())
+
+
+def _log_sizes(size: IntArray) -> float:
+    """Log-probability of the clusters' sizes: Poisson from one upwards, but for a share of loose flowers.
+
+    That share is as the partition itself has it, with a weak prior of one in four.
+    """
+    c = len(size)
+    mean = max(size.mean(), 1.0 + 1e-6)
+    poisson = size * np.log(mean) - mean - gammaln(size + 1.0) - np.log1p(-np.exp(-mean))
+    loose = float((np.count_nonzero(size == 1) + 1.0) / (c + 4.0))
+    return float((np.log1p(-loose) + np.logaddexp(poisson, np.where(size == 1, np.log(loose), -np.inf))).sum())
 
 
 def likeliest_cut(tree: Array, likelihood: Likelihood) -> IntArray:

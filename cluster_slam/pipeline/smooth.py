@@ -67,7 +67,7 @@ def smooth(
         world = settle(frames, world, smoother, estimate)
     world = learn(world, smoother, estimate)
     if world.cov_step is None:
-        world = regroup(frames, world, config, rng)
+        world = regroup(frames, world, estimate, config, rng)
     frames, model = for_solving(stated, stated_poses, world)
     smoother, estimate = solve(frames, model, world, config, 2)
     world = learn(world, smoother, estimate)
@@ -109,7 +109,7 @@ def _associate_and_smooth(
             world = replace(world, errs_slowly=observations_err_slowly(frames, model, world))
         smoother, estimate = solve(frames, model, world, config, 2)
         world = learn(world, smoother, estimate)
-        world = regroup(frames, world, config, rng)
+        world = regroup(frames, world, estimate, config, rng)
         clock.lap("smoothing")
         if is_last:
             break

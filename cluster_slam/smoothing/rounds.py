@@ -100,11 +100,13 @@ def observations_err_slowly(frames: Frames, model: PoseModel, world: World) -> b
     return errs_slowly(smoother, replace(start, d=np.zeros_like(start.d)))
 
 
-def regroup(frames: Frames, world: World, config: SmoothConfig, rng: np.random.Generator) -> World:
-    """Group the flowers again, now that it is known how each moved."""
+def regroup(
+    frames: Frames, world: World, estimate: Estimate, config: SmoothConfig, rng: np.random.Generator
+) -> World:
+    """Group the flowers again, now that it is known how each moved; outliers have no say."""
     n = len(world.places)
     presence = presence_of(frames.frame, world.landmark, n, frames.n_frames)
-    used = world.landmark >= 0
+    used = (world.landmark >= 0) & (estimate.weight > 0.5)
     u = np.full((frames.n_frames, n, 3), np.nan)
     var = np.full((frames.n_frames, n), np.nan)
     at = (frames.frame[used], world.landmark[used])
