@@ -75,7 +75,15 @@ def _filter_class() -> type[Any]:
 def _sigma_points(n: int, alpha: float) -> Any:
     from filterpy.kalman import MerweScaledSigmaPoints
 
-    return MerweScaledSigmaPoints(n, alpha, 2.0, 0.0, sqrt_method=safe_root)
+    class Drawn(MerweScaledSigmaPoints):  # type: ignore[misc]
+        """The same points, drawn at once."""
+
+        def sigma_points(self, x: Array, P: Array) -> Array:
+            spread = self.alpha**2 * (self.n + self.kappa)
+            U = safe_root(spread * P)
+            return np.concatenate([x[None], x + U, x - U])
+
+    return Drawn(n, alpha, 2.0, 0.0)
 
 
 def _moments(points: Array, Wm: Array, Wc: Array, noise_cov: Array, *_: Any) -> tuple[Array, Array]:
@@ -83,6 +91,11 @@ def _moments(points: Array, Wm: Array, Wc: Array, noise_cov: Array, *_: Any) -> 
     mean = Wm @ points
     delta = points - mean
     return mean, symmetrise(delta.T @ (Wc[:, None] * delta) + noise_cov)
+
+
+def prepare() -> None:
+    """Import filterpy now, so that the first filter is not late."""
+    _filter_class()
 
 
 class UnscentedFilter:
@@ -126,11 +139,13 @@ class UnscentedFilter:
         if not np.isfinite(x).all():
             raise ParameterError("state: not finite")
         self._ukf.x, self._ukf.P = np.array(x, float), ensure_positive_definite(P, "state covariance")
+        self._are_drawn = False  # sigma points of this very state
 
     def predict(self, process: Function, Q: Array) -> None:
         """Move all by ``process`` ((s, n) -> (s, n)) and add noise Q (n, n)."""
         self._ukf.Q = Q
         self._ukf.predict(UT=_moments, fx=process)
+        self._are_drawn = True
 
     def innovation(self, z: Array, R: Array, measure: Function) -> Innovation:
         """What an update with this measurement would see; nothing is changed."""
@@ -153,7 +168,9 @@ class UnscentedFilter:
         R = ensure_positive_definite(R, "measurement covariance")
         ukf = self._ukf
         before = ukf.x, ukf.P
-        ukf.sigmas_f = ukf.points_fn.sigma_points(ukf.x, ukf.P)
+        if not self._are_drawn:
+            ukf.sigmas_f = ukf.points_fn.sigma_points(ukf.x, ukf.P)
+        self._are_drawn = False
         predicted = measure(ukf.sigmas_f)
         rows = iter(predicted)
         ukf._dim_z = len(z)

@@ -12,9 +12,15 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dpotrf, dpotri
 
+from cluster_slam.errors import EstimationError
 from cluster_slam.geometry import Array
 from cluster_slam.records import BoolArray, IntArray
+
+_ROOM = 64  # flowers, at first; it doubles
+_SURE = 1e12  # information of what is known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,30 +67,37 @@ def eliminate(m: FrameMatches) -> FrameFactor:
     q = len(m.ids)
     clusters, s = np.unique(m.cluster, return_inverse=True)
     n_nuisance = 6 + 3 * len(clusters)
-    by_nuisance = np.zeros((q, 3, n_nuisance))  # dz and d
-    by_nuisance[:, :, :6] = m.J
-    by_kept = np.zeros((q, 3, 6 + 3 * q))  # x and L
-    by_kept[:, :, :6] = m.J_x
+    N = np.zeros((q, 3, n_nuisance))  # by dz and d
+    N[:, :, :6] = m.J
     k = np.arange(q)
     for a in range(3):
-        by_nuisance[k, a, 6 + 3 * s + a] = -1.0
-        by_kept[k, a, 6 + 3 * k + a] = -1.0
-    WN = (m.W @ by_nuisance).reshape(3 * q, n_nuisance)
-    WT = (m.W @ by_kept).reshape(3 * q, -1)
+        N[k, a, 6 + 3 * s + a] = -1.0
+    WN = (m.W @ N).reshape(3 * q, n_nuisance)
+    flat = N.reshape(3 * q, n_nuisance)
     Wy = (m.W @ m.points[..., None]).reshape(3 * q)
-    N, T = by_nuisance.reshape(3 * q, -1), by_kept.reshape(3 * q, -1)
-    D = N.T @ WN
+    WJ = (m.W @ m.J_x).reshape(3 * q, 6)
+    J_x = m.J_x.reshape(3 * q, 6)
+    D = flat.T @ WN
     D[:6, :6] += m.prior
     var = np.zeros(len(clusters))
     var[s] = m.sway_var
-    D[np.arange(6, n_nuisance), np.arange(6, n_nuisance)] += np.repeat(1.0 / var, 3)
-    e = -(N.T @ Wy)
+    at = np.arange(6, n_nuisance)
+    D[at, at] += np.repeat(1.0 / var, 3)
+    e = -(flat.T @ Wy)
     e[:6] -= m.prior @ m.z
-    C = T.T @ WN
-    gain = np.linalg.solve(D, C.T).T
-    H = T.T @ WT - gain @ C.T
-    g = -(T.T @ Wy) - gain @ e
-    return FrameFactor(m.stamp, m.ids, 0.5 * (H + H.T), g)
+    C = np.concatenate([J_x.T @ WN, -WN])  # of x and L with the frame's own
+    half = solve_triangular(np.linalg.cholesky(D), np.column_stack([C.T, e]), lower=True, check_finite=False)
+    H = -(half[:, :-1].T @ half[:, :-1])
+    g = -(half[:, :-1].T @ half[:, -1])
+    H[:6, :6] += J_x.T @ WJ
+    H[:6, 6:] -= WJ.T
+    H[6:, :6] -= WJ
+    rows = 6 + 3 * k[:, None, None] + np.arange(3)[:, None]
+    cols = 6 + 3 * k[:, None, None] + np.arange(3)
+    H[rows, cols] += m.W
+    g[:6] -= J_x.T @ Wy
+    g[6:] += Wy
+    return FrameFactor(m.stamp, m.ids, H, g)
 
 
 class IncrementalMap:
@@ -94,66 +107,78 @@ class IncrementalMap:
         """``hand_eye_information`` (6, 6) of the tangent's prior, mean zero; None: it is known, or there is none."""
         self.ids: IntArray = np.zeros(0, dtype=np.int64)
         self.window_s = window_s
-        self.H = np.zeros((6, 6))
-        self.g = np.zeros(6)
         self.is_frozen = hand_eye_information is None
-        self.H += 1e12 * np.eye(6) if hand_eye_information is None else hand_eye_information
+        self._H, self._g = np.zeros((6 + 3 * _ROOM, 6 + 3 * _ROOM)), np.zeros(6 + 3 * _ROOM)
+        self._H[:6, :6] = _SURE * np.eye(6) if hand_eye_information is None else hand_eye_information
+        self.hand_eye: Array = np.zeros(6)  # the frozen tangent
+        self._row: dict[int, int] = {}
         self.recent: deque[tuple[FrameMatches, FrameFactor]] = deque()
 
     def __len__(self) -> int:
         return len(self.ids)
 
-    def _rows(self, ids: IntArray) -> IntArray:
-        order = np.argsort(self.ids)
-        return order[np.searchsorted(self.ids[order], ids)]
+    @property
+    def information(self) -> tuple[Array, Array]:
+        """Information (6 + 3 l, 6 + 3 l) and vector (6 + 3 l,) of hand-eye tangent and places, as ``ids``."""
+        n = 6 + 3 * len(self.ids)
+        return self._H[:n, :n], self._g[:n]
+
+    def rows(self, ids: IntArray) -> IntArray:
+        """Row of each flower (k,) in ``ids``."""
+        return np.array([self._row[i] for i in ids.tolist()], dtype=np.int64)
 
     def _index(self, ids: IntArray) -> IntArray:
-        rows = self._rows(ids)
-        return np.concatenate([np.arange(6), (6 + 3 * rows[:, None] + np.arange(3)).ravel()])
+        return np.concatenate([np.arange(6), (6 + 3 * self.rows(ids)[:, None] + np.arange(3)).ravel()])
 
     def include(self, flower_id: int, point: Array, cov: Array, J_x: Array) -> None:
         """A new unknown, seen at ``point`` (3,), covariance (3, 3), by observations that are not in the map.
 
         ``point`` is at the hand-eye transform of linearisation, and moves with its tangent by ``J_x`` (3, 6).
         """
-        n = len(self.g)
-        H, g = np.zeros((n + 3, n + 3)), np.zeros(n + 3)
-        H[:n, :n], g[:n] = self.H, self.g
+        n = 6 + 3 * len(self.ids)
+        if n + 3 > len(self._g):
+            H, g = np.zeros((2 * n, 2 * n)), np.zeros(2 * n)
+            H[:n, :n], g[:n] = self._H[:n, :n], self._g[:n]
+            self._H, self._g = H, g
+        self._H[n : n + 3], self._H[:, n : n + 3], self._g[n : n + 3] = 0.0, 0.0, 0.0
         W = np.linalg.inv(cov)
         A = np.concatenate([-J_x, np.eye(3)], axis=1)
         index = np.r_[np.arange(6), np.arange(n, n + 3)]
-        H[np.ix_(index, index)] += A.T @ W @ A
-        g[index] += A.T @ W @ point
-        self.H, self.g = H, g
+        self._H[np.ix_(index, index)] += A.T @ W @ A
+        self._g[index] += A.T @ W @ point
+        self._row[flower_id] = len(self.ids)
         self.ids = np.append(self.ids, flower_id)
 
     def remove(self, flower_id: int) -> None:
-        """Take a flower out of the map with all that was said of it (it was none)."""
-        row = int(self._rows(np.array([flower_id]))[0])
-        keep = np.ones(len(self.g), dtype=bool)
-        keep[6 + 3 * row : 9 + 3 * row] = False
+        """Take a flower out: what the window's frames said of it is undone, what is older is averaged out."""
         for m, _ in list(self.recent):
             if (m.ids == flower_id).any():
                 self.replace(m, m.only(m.ids != flower_id))
-        # what older frames said of it: condition the rest on nothing, that is, marginalise it out
-        a, b = keep, ~keep
-        gain = np.linalg.solve(self.H[np.ix_(b, b)], self.H[np.ix_(b, a)]).T
-        self.H = self.H[np.ix_(a, a)] - gain @ self.H[np.ix_(b, a)]
-        self.g = self.g[a] - gain @ self.g[b]
-        self.ids = np.delete(self.ids, row)
+        H, g = self.information
+        row = self._row[flower_id]
+        b = np.zeros(len(g), dtype=bool)
+        b[6 + 3 * row : 9 + 3 * row] = True
+        a = ~b
+        gain = np.linalg.solve(H[np.ix_(b, b)], H[np.ix_(b, a)]).T
+        self._take(H[np.ix_(a, a)] - gain @ H[np.ix_(b, a)], g[a] - gain @ g[b], np.delete(self.ids, row))
 
     def merge(self, goes: int, stays: int) -> None:
         """Two flowers are one: all that was said of the one was said of the other."""
-        r, s = self._rows(np.array([goes, stays])).tolist()
-        n = len(self.g)
-        P = np.eye(n)
-        P[6 + 3 * r : 9 + 3 * r, 6 + 3 * s : 9 + 3 * s] = np.eye(3)
-        keep = np.ones(n, dtype=bool)
-        keep[6 + 3 * r : 9 + 3 * r] = False
-        P = P[:, keep]
-        self.H, self.g = P.T @ self.H @ P, P.T @ self.g
-        self.ids = np.delete(self.ids, r)
+        r, s = self._row[goes], self._row[stays]
+        H, g = (x.copy() for x in self.information)
+        of, to = slice(6 + 3 * r, 9 + 3 * r), slice(6 + 3 * s, 9 + 3 * s)
+        H[to] += H[of]
+        H[:, to] += H[:, of]
+        g[to] += g[of]
+        a = np.ones(len(g), dtype=bool)
+        a[of] = False
+        self._take(H[np.ix_(a, a)], g[a], np.delete(self.ids, r))
         self.recent = deque((m, f) for m, f in self.recent if goes not in m.ids)
+
+    def _take(self, H: Array, g: Array, ids: IntArray) -> None:
+        n = len(g)
+        self._H[:n, :n], self._g[:n], self.ids = H, g, ids
+        self._row = {i: k for k, i in enumerate(ids.tolist())}
 
     def add(self, m: FrameMatches) -> None:
         """Take in the matches of a frame."""
@@ -180,20 +205,46 @@ class IncrementalMap:
 
     def _sum(self, factor: FrameFactor, sign: float) -> None:
         index = self._index(factor.ids)
-        self.H[np.ix_(index, index)] += sign * factor.H
-        self.g[index] += sign * factor.g
+        self._H[index[:, None], index] += sign * factor.H
+        self._g[index] += sign * factor.g
 
     def freeze(self, x: Array) -> None:
         """From now on the hand-eye tangent is x (6,)."""
-        self.H[:6, :6] += 1e12 * np.eye(6)
-        self.g[:6] += 1e12 * x
-        self.is_frozen = True
+        self._H[:6, :6] += _SURE * np.eye(6)
+        self._g[:6] += _SURE * x
+        self.is_frozen, self.hand_eye = True, x
 
     def solve(self) -> tuple[Array, Array, Array]:
         """Hand-eye tangent (6,), places (l, 3), joint covariance (6 + 3 l, 6 + 3 l)."""
-        scale = 1.0 / np.sqrt(np.diag(self.H))
-        L = np.linalg.cholesky(self.H * scale[:, None] * scale)
-        half = np.linalg.solve(L, np.diag(scale))
-        cov = half.T @ half
-        x = cov @ self.g
+        H, g = self.information
+        cov = _inverse(H)
+        x = cov @ g
         return x[:6], x[6:].reshape(-1, 3), cov
+
+    def solve_near(self, ids: IntArray, known: Array) -> tuple[Array, Array]:
+        """Places (k, 3) and covariances (k, 3, 3) of these flowers, all others held at ``known`` (l, 3).
+
+        One block of a Gauss-Seidel iteration: it costs what is in view, however large the map is.
+        """
+        H, g = self.information
+        rows = self.rows(ids)
+        index = (6 + 3 * rows[:, None] + np.arange(3)).ravel()
+        rest = np.concatenate([self.hand_eye, known.ravel()])
+        rest[index] = 0.0
+        near = H[index]
+        cov = _inverse(near[:, index])
+        x = cov @ (g[index] - near @ rest)
+        k = len(ids)
+        blocks = cov.reshape(k, 3, k, 3)
+        return x.reshape(k, 3), blocks[np.arange(k), :, np.arange(k)]
+
+
+def _inverse(H: Array) -> Array:
+    """Covariance of an information matrix, by Cholesky, each unknown in its own unit."""
+    scale = 1.0 / np.sqrt(np.diag(H))
+    factor, _ = dpotrf(H * scale[:, None] * scale, lower=1, overwrite_a=1)
+    upper, failed = dpotri(factor, lower=1, overwrite_c=1)
+    if failed:
+        raise EstimationError("the map's information matrix is not positive definite")
+    cov = np.tril(upper) + np.tril(upper, -1).T
+    return np.asarray(cov * scale[:, None] * scale)

@@ -6,6 +6,7 @@ the descriptor of the seen ones, which tells the scale.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,14 +14,16 @@ import numpy as np
 from cluster_slam.descriptors import inertia_and_mean_distance
 from cluster_slam.geometry import Array
 from cluster_slam.records import State
-from tracking.gaussian import LOG_2PI
 from tracking.motion import MotionConfig, MotionKind, advance, amplitude, process_noise, state_at_rest
 from tracking.ukf import Innovation, UnscentedFilter
 
 _LONG_S = 0.5  # a prediction over longer knows no phase
-_WAKE_M = 0.004  # how far a cluster is from rest that begins to move, one sigma
-_SWITCH = 0.02  # probability of a change of motion from one measurement to the next
+_NAP_S = 0.5  # a cluster at rest is put through its filter this often
+WAKE_M = 0.004  # how far a cluster is from rest that begins to move, one sigma
+_TOUCHED = 0.005  # probability that a cluster at rest is touched between two measurements
+_CALMED = 0.03  # that one that sways has come to rest
 _SURE = 3.0  # log odds at which the motion is switched
+_MOST = 8.0  # log-likelihood ratio that one measurement may have: gates let wrong ones through
 _UNSEEN_M = 0.002  # a cluster that is not looked at may have been moved so far, one sigma ...
 _UNSEEN_S = 5.0  # ... after so long
 _PUSHED_NIS = 25.0  # of three degrees of freedom: something pushed it again
@@ -36,7 +39,11 @@ class Shape:
 
 
 class ClusterTrack:
-    """The state of one cluster. ``anchor`` (3,) is its centroid at rest as the map has it, m."""
+    """The state of one cluster. ``anchor`` (3,) is its centroid at rest as the map has it, m.
+
+    A cluster at rest needs no filter from frame to frame: what it does is known in closed form. Its filter is stepped
+    while it moves, and now and then while it rests and is seen (for its scale).
+    """
 
     def __init__(self, cluster_id: int, stamp: float, config: MotionConfig) -> None:
         self.id, self.config = cluster_id, config
@@ -46,17 +53,22 @@ class ClusterTrack:
         self.kind, self.why = MotionKind.REST, "new"
         self.log_odds = -_SURE  # of sway against rest
         self.anchor: Array | None = None
+        self.anchor_cov: Array = 1e-6 * np.eye(3)
         self.filter: UnscentedFilter | None = None
+        self.trembling: tuple[Array, Array] | None = None  # at rest: displacement and covariance when last seen
         self.last_nis = float("nan")
+        self.last_shape = -np.inf
+
+    @property
+    def is_moving(self) -> bool:
+        return self.kind is not MotionKind.REST and self.filter is not None
 
     def place(self, anchor: Array) -> None:
         """The map has moved the centroid at rest: the displacement stays what it was."""
-        if self.anchor is None or self.filter is None:
-            self.anchor = anchor
-            return
-        x = self.filter.x.copy()
-        x[:3] += anchor - self.anchor
-        self.filter.reset(x, self.filter.P)
+        if self.anchor is not None and self.filter is not None:
+            x = self.filter.x.copy()
+            x[:3] += anchor - self.anchor
+            self.filter.reset(x, self.filter.P)
         self.anchor = anchor
 
     def awaken(self, stamp: float) -> None:
@@ -65,121 +77,143 @@ class ClusterTrack:
             self.filter = UnscentedFilter(*state_at_rest(self.anchor, self.config))
             self.stamp = stamp
 
-    @property
-    def displacement(self) -> tuple[Array, Array]:
-        """Displacement from rest (3,) and covariance (3, 3), at the time of the last prediction."""
-        if self.filter is None or self.anchor is None:
-            return np.zeros(3), self.config.tremble_m**2 * np.eye(3)
-        return self.filter.x[:3] - self.anchor, self.filter.P[:3, :3]
+    def displacement(self, stamp: float) -> tuple[Array, Array]:
+        """Displacement from rest (3,) and covariance (3, 3), predicted for now (a moving one: at its filter's time)."""
+        if self.is_moving and self.filter is not None and self.anchor is not None:
+            return self.filter.x[:3] - self.anchor, self.filter.P[:3, :3]
+        unseen = max(stamp - self.last, 0.0)
+        var = self.config.tremble_m**2 + _UNSEEN_M**2 * (1.0 - np.exp(-unseen / _UNSEEN_S))
+        return np.zeros(3), var * np.eye(3)
 
     @property
     def scale(self) -> float:
         return 1.0 if self.filter is None else float(np.exp(self.filter.x[6]))
 
     @property
+    def velocity(self) -> Array:
+        """Velocity (3,) m/s."""
+        return self.filter.x[3:6] if self.is_moving and self.filter is not None else np.zeros(3)
+
+    @property
     def reach(self) -> float:
         """How far from rest it swings at present, m."""
-        if self.filter is None or self.anchor is None or self.kind is MotionKind.REST:
+        if not self.is_moving or self.filter is None or self.anchor is None:
             return self.config.tremble_m
         return max(amplitude(self.filter.x, self.anchor), self.config.tremble_m)
 
-    def predict(self, stamp: float) -> None:
-        """Bring the state to this time."""
-        dt = stamp - self.stamp
-        if dt <= 0.0 or self.filter is None or self.anchor is None:
-            return
-        if dt > _LONG_S:
-            self._predict_far(dt)
+    def now(self) -> tuple[Array, Array, Array]:
+        """Centroid (3,), velocity (3,), and their covariance (6, 6), the map's own with it."""
+        anchor = np.zeros(3) if self.anchor is None else self.anchor
+        cov = np.zeros((6, 6))
+        if self.is_moving and self.filter is not None:
+            position, velocity = self.filter.x[:3], self.filter.x[3:6]
+            cov[:] = self.filter.P[:6, :6]
         else:
-            anchor, kind, config = self.anchor, self.kind, self.config
-            Q = process_noise(self.filter.x, dt, anchor, kind, config)
-            self.filter.predict(lambda s: advance(s, dt, anchor, kind, config), Q)
+            d, P = self.trembling or (np.zeros(3), self.config.tremble_m**2 * np.eye(3))
+            position, velocity = anchor + d, np.zeros(3)
+            cov[:3, :3], cov[3:, 3:] = P, (self.config.tremble_m / self.config.tremble_s) ** 2 * np.eye(3)
+        cov[:3, :3] += self.anchor_cov
+        return position, velocity, cov
+
+    def predict(self, stamp: float) -> None:
+        """Bring the filter to this time."""
+        f, anchor, dt = self.filter, self.anchor, stamp - self.stamp
+        if dt <= 0.0 or f is None or anchor is None:
+            return
+        kind, config = self.kind, self.config
+        if dt > _LONG_S and kind is not MotionKind.GROWTH:
+            self._predict_far(f, anchor, dt)
+        else:
+            Q = process_noise(f.x, dt, anchor, kind, config)
+            f.predict(lambda s: advance(s, dt, anchor, kind, config), Q)
         self.stamp = stamp
 
-    def _predict_far(self, dt: float) -> None:
+    def _predict_far(self, f: UnscentedFilter, anchor: Array, dt: float) -> None:
         """Over a long time the phase of a sway is lost, and what is left of it may point anywhere."""
-        assert_filter, anchor = self.filter, self.anchor
-        if assert_filter is None or anchor is None:
-            return
-        before, x = assert_filter.P, assert_filter.x.copy()
+        before, x = f.P, f.x.copy()
         rest, P = state_at_rest(anchor, self.config)
         omega = np.exp(x[7])
-        left = self.reach * np.exp(-self.config.damping * omega * dt) if self.kind is MotionKind.SWAY else 0.0
+        left = self.reach * np.exp(-self.config.damping * omega * dt) if self.is_moving else 0.0
         moved = _UNSEEN_M**2 * (1.0 - np.exp(-dt / _UNSEEN_S))
         P[:3, :3] += (left**2 + moved) * np.eye(3)
         P[3:6, 3:6] += (left**2 + moved) * omega**2 * np.eye(3)
         P[6, 6] = before[6, 6] + self.config.scale_walk**2 * dt
         P[7, 7] = min(before[7, 7] + self.config.frequency_walk**2 * dt, self.config.sway_log_sigma**2)
         rest[6:] = x[6:]
-        if self.kind is MotionKind.SWAY and left < self.config.tremble_m:
+        if self.is_moving and left < self.config.tremble_m:
             self._switch(MotionKind.REST, "its sway has died away unseen")
-        assert_filter.reset(rest, P)
+        f.reset(rest, P)
 
-    def update(self, shift: Array, cov: Array, shape: Shape | None, stamp: float) -> Innovation | None:
-        """Take in where it was seen: ``shift`` (3,) of its centroid from the prediction, with covariance (3, 3)."""
-        if self.filter is None or self.anchor is None:
-            return None
+    def weigh(self, at_rest: float, waking: float, shift: Array, cov: Array) -> None:
+        """Weigh the evidence for sway against rest; switch when it is clear, before any update is made.
+
+        ``at_rest`` and ``waking`` are the log-likelihoods of where it was seen if it rests and if it begins to move;
+        ``shift`` (3,) from where it was predicted, with ``cov`` (3, 3).
+        """
         f = self.filter
-        z = f.x[:3] + shift
-        self._weigh(z, shift, cov)
+        if f is None or self.anchor is None:
+            return
+        moving = waking
+        if self.is_moving:
+            S = f.P[:3, :3] + cov
+            self.last_nis = float(shift @ np.linalg.solve(S, shift))
+            moving = -0.5 * (self.last_nis + float(np.linalg.slogdet(S)[1]))
+        p = 1.0 / (1.0 + np.exp(-min(max(self.log_odds, -30.0), 30.0)))
+        p = p * (1.0 - _CALMED) + (1.0 - p) * _TOUCHED
+        self.log_odds = float(np.log(p / (1.0 - p))) + min(max(moving - at_rest, -_MOST), _MOST)
+        if not self.is_moving and self.log_odds > _SURE:
+            x, P = state_at_rest(self.anchor, self.config)
+            x[6:], P[6, 6], P[7, 7] = f.x[6:], f.P[6, 6], f.P[7, 7]
+            f.reset(x, P)
+            self._switch(MotionKind.SWAY, f"it stands {1e3 * float(np.linalg.norm(shift)):.1f} mm from rest")
+            self._loosen(f)
+        elif self.is_moving and self.log_odds < -_SURE:
+            self._switch(MotionKind.REST, "it has come to rest")
+            x, P = state_at_rest(self.anchor, self.config)
+            x[6:], P[6, 6], P[7, 7] = f.x[6:], f.P[6, 6], f.P[7, 7]
+            f.reset(x, P)
+        elif self.is_moving and self.last_nis > _PUSHED_NIS:
+            self.why = "it was pushed again"
+            self._loosen(f)
+
+    def _loosen(self, f: UnscentedFilter) -> None:
+        """Anything may have happened to its velocity."""
+        P = f.P.copy()
+        P[:3, :3] += 1e-6 * np.eye(3)
+        P[3:6, 3:6] += 0.15**2 * np.eye(3)
+        f.reset(f.x, P)
+
+    def wants_filter(self, stamp: float) -> bool:
+        """Whether its filter should take this measurement: it moves, or has rested for a while."""
+        return self.filter is not None and (self.is_moving or stamp - self.stamp >= _NAP_S)
+
+    def wants_shape(self, stamp: float) -> bool:
+        """Whether it is time to look at its scale again, which changes slowly."""
+        return stamp - self.last_shape >= _NAP_S
+
+    def update(self, seen_at: Array, cov: Array, shape: Shape | None, stamp: float) -> Innovation | None:
+        """Take in where it was seen: its centroid at ``seen_at`` (3,), covariance (3, 3)."""
+        f = self.filter
+        if f is None or self.anchor is None:
+            return None
+        self.predict(stamp)
         if shape is None:
-            innovation = f.update(z, cov, lambda s: s[:, :3])
+            innovation = f.update(seen_at, cov, lambda s: s[:, :3])
         else:
+            self.last_shape = stamp
             R = np.zeros((5, 5))
             R[:3, :3], R[3:, 3:] = cov, shape.cov
-            powers = np.array([2.0, 1.0])
-            at_rest = shape.at_rest
-            innovation = f.update(
-                np.concatenate([z, shape.seen]),
-                R,
-                lambda s: np.concatenate([s[:, :3], at_rest * np.exp(powers * s[:, 6:7])], axis=1),
-            )
-        if abs(f.x[6]) > 0.7 or not 0.5 < f.x[7] < 4.5:
+            innovation = f.update(np.concatenate([seen_at, shape.seen]), R, _measured_by(shape.at_rest))
+        if abs(f.x[6]) > _WIDEST or not _SLOWEST < f.x[7] < _FASTEST:
             x = f.x.copy()
-            x[6], x[7] = np.clip(x[6], -0.7, 0.7), np.clip(x[7], 0.5, 4.5)
+            x[6], x[7] = np.clip(x[6], -_WIDEST, _WIDEST), np.clip(x[7], _SLOWEST, _FASTEST)
             f.reset(x, f.P)
         return innovation
 
-    def _weigh(self, z: Array, shift: Array, cov: Array) -> None:
-        """Weigh the evidence for sway against rest; switch when it is clear, and before the update is made."""
-        f, anchor, c = self.filter, self.anchor, self.config
-        if f is None or anchor is None:
-            return
-        S = f.P[:3, :3] + cov
-        self.last_nis = float(shift @ np.linalg.solve(S, shift))
-        u, eye = z - anchor, np.eye(3)
-        at_rest = _log_normal(u, cov + c.tremble_m**2 * eye)
-        if self.kind is MotionKind.SWAY:
-            moving = _log_normal(shift, S)
-        else:
-            moving = _log_normal(u, cov + _WAKE_M**2 * eye)
-        p = 1.0 / (1.0 + np.exp(-np.clip(self.log_odds, -30, 30)))
-        p = p * (1 - _SWITCH) + (1 - p) * _SWITCH
-        self.log_odds = float(np.log(p / (1 - p)) + np.clip(moving - at_rest, -8.0, 8.0))
-        if self.kind is MotionKind.REST and self.log_odds > _SURE:
-            self._switch(MotionKind.SWAY, f"it stands {1e3 * np.linalg.norm(u):.1f} mm from rest")
-            self._loosen()
-        elif self.kind is MotionKind.SWAY and self.log_odds < -_SURE:
-            self._switch(MotionKind.REST, "it has come to rest")
-            x, P = state_at_rest(anchor, c)
-            x[6:], P[6, 6] = f.x[6:], f.P[6, 6]
-            f.reset(x, P)
-        elif self.kind is MotionKind.SWAY and self.last_nis > _PUSHED_NIS:
-            self.why = "it was pushed again"
-            self._loosen()
-
-    def _loosen(self) -> None:
-        """Anything may have happened to its velocity."""
-        f = self.filter
-        if f is not None:
-            P = f.P.copy()
-            P[:3, :3] += 1e-6 * np.eye(3)
-            P[3:6, 3:6] += 0.15**2 * np.eye(3)
-            f.reset(f.x, P)
-
-    def jump(self, d: Array, cov: Array, speed: float, velocity: Array | None, reason: str) -> None:
+    def jump(self, d: Array, cov: Array, speed: float, velocity: Array | None, reason: str, stamp: float) -> None:
         """It was found displaced by d (3,), covariance (3, 3), and may move at any speed up to about ``speed`` m/s."""
-        if self.filter is None or self.anchor is None:
+        f = self.filter
+        if f is None or self.anchor is None:
             return
         x, P = state_at_rest(self.anchor, self.config)
         x[:3] += d
@@ -187,18 +221,24 @@ class ClusterTrack:
             x[3:6] = velocity
         P[:3, :3] = cov
         P[3:6, 3:6] = speed**2 * np.eye(3)
-        x[6], P[6, 6] = self.filter.x[6], self.filter.P[6, 6]
-        self.filter.reset(x, P)
+        x[6], P[6, 6] = f.x[6], f.P[6, 6]
+        f.reset(x, P)
+        self.stamp = stamp
         self._switch(MotionKind.SWAY, reason)
 
     def _switch(self, kind: MotionKind, reason: str) -> None:
-        self.kind, self.why = kind, reason
+        self.kind, self.why, self.trembling = kind, reason, None
         self.log_odds = _SURE if kind is MotionKind.SWAY else -_SURE
 
 
-def _log_normal(v: Array, S: Array) -> float:
-    _, log_det = np.linalg.slogdet(S)
-    return float(-0.5 * (v @ np.linalg.solve(S, v) + log_det + len(v) * LOG_2PI))
+_WIDEST = 0.7  # log scale
+_SLOWEST, _FASTEST = 0.5, 4.5  # log angular frequency
+
+
+def _measured_by(at_rest: Array) -> Callable[[Array], Array]:
+    """What states (s, 8) show: centroid, and inertia and mean distance, which grow with scale squared and scale."""
+    powers = np.array([2.0, 1.0])
+    return lambda s: np.concatenate([s[:, :3], at_rest * np.exp(powers * s[:, 6:7])], axis=1)
 
 
 def seen_shape(offsets: Array, points: Array, var: Array) -> Shape | None:

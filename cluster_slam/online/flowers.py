@@ -23,6 +23,7 @@ _FIELDS: dict[str, tuple[tuple[int, ...], type]] = {
     "looks": ((), np.float64),  # frames that looked at it, old ones forgotten
     "found": ((), np.float64),  # of those, how many saw it
     "confirmed": ((), np.bool_),
+    "seat": ((), np.int64),  # of a confirmed flower in the grouping's sums, -1 of a tentative one
 }
 
 
@@ -42,6 +43,7 @@ class FlowerTable:
     looks: Array
     found: Array
     confirmed: BoolArray
+    seat: IntArray
 
     def __init__(self) -> None:
         self.next_id = 0
@@ -64,6 +66,7 @@ class FlowerTable:
         new |= {"place": place, "cov": cov, "lever": lever, "slot": slot}
         new["n"][:] = new["hits"][:] = 1
         new["looks"][:] = new["found"][:] = 1.0
+        new["seat"][:] = -1
         new["first"][:] = new["last"][:] = stamp
         self.next_id += q
         for name in _FIELDS:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.sparse import csr_matrix
@@ -13,35 +11,38 @@ from scipy.special import gammaln
 from cluster_slam.config import GroupingConfig
 from cluster_slam.geometry import Array
 from cluster_slam.grouping import group_flowers
-from cluster_slam.records import BoolArray, IntArray
+from cluster_slam.records import IntArray
 
 _FORGET = 1.0 / 3.0  # of the local mean of a flower's displacement: it then has a fifth of the noise
 _FEWEST = 3  # members of what is called a cluster
 _CLEARLY = 3.0  # log-likelihood by which another grouping must be better than the one that is
 _TORN = 2.0  # factor on the distance of two flowers that certainly do not move together
+_ROOM = 64  # seats, at first; they double
 _ENOUGH_LOOKS = 10  # before it can be said that neighbours are not seen together
-_KEPT_LOOKS = 200  # frames of which it is known who was seen together
 
 
 class CommonMotion:
     """Sums over the frames that saw two flowers, one of them off its rest: do they swing together?
 
-    All matrices are (l, l) over the rows of the flower table.
+    All matrices are (n, n) over seats.
     """
 
     def __init__(self) -> None:
-        self.sums = np.zeros((5, 0, 0))  # |u_f - u_g|^2, |u_f|^2 + |u_g|^2, noise, noise^2, count
-        self.mean = np.zeros((0, 3))  # local mean of displacements
+        self.sums = np.zeros((5, _ROOM, _ROOM))  # |u_f - u_g|^2, |u_f|^2 + |u_g|^2, noise, noise^2, count
+        self.mean = np.zeros((_ROOM, 3))  # local mean of displacements
 
-    def resize(self, keep: BoolArray | None, n: int) -> None:
-        """Follow the flower table: rows kept, and then ``n`` in all."""
-        if keep is not None and not keep.all():
-            self.sums, self.mean = self.sums[:, keep][:, :, keep], self.mean[keep]
+    def grow(self, n: int) -> None:
+        """Room for ``n`` seats."""
         old = len(self.mean)
-        if n > old:
-            sums, mean = np.zeros((5, n, n)), np.zeros((n, 3))
-            sums[:, :old, :old], mean[:old] = self.sums, self.mean
-            self.sums, self.mean = sums, mean
+        sums, mean = np.zeros((5, n, n)), np.zeros((n, 3))
+        sums[:, :old, :old], mean[:old] = self.sums, self.mean
+        self.sums, self.mean = sums, mean
+
+    def clear(self, seats: IntArray) -> None:
+        """Nothing is known of who sits there."""
+        self.sums[:, seats] = 0.0
+        self.sums[:, :, seats] = 0.0
+        self.mean[seats] = 0.0
 
     def observe(self, rows: IntArray, u: Array, var: Array) -> None:
         """Displacements u (q, 3) of flowers from their own rest, with variances (q,) along an axis."""
@@ -68,30 +69,56 @@ class CommonMotion:
 
 
 class OnlineGrouping:
-    """Groups flowers; remembers who was seen together."""
+    """Groups flowers; remembers who was seen together and who moved together, by their seats."""
 
     def __init__(self, config: GroupingConfig) -> None:
         self.config = config
         self.motion = CommonMotion()
-        self.looks: deque[IntArray] = deque(maxlen=_KEPT_LOOKS)  # ids seen together
+        self.counts = np.zeros((_ROOM, _ROOM))  # frames that saw both (the diagonal: that saw it)
+        self.free = list(range(_ROOM))[::-1]
         self.link = 0.0  # m, flowers nearer than this to a cluster join it
+        self.is_stale = False  # flowers were confirmed since the last grouping
 
-    def group(
-        self, ids: IntArray, rows: IntArray, places: Array, now: IntArray, volume: float, rng: np.random.Generator
-    ) -> IntArray:
-        """Cluster 0..c-1 of each flower (l,).
+    def sit(self) -> int:
+        """A seat for one more flower."""
+        if not self.free:
+            old = len(self.counts)
+            counts = np.zeros((2 * old, 2 * old))
+            counts[:old, :old] = self.counts
+            self.counts = counts
+            self.motion.grow(2 * old)
+            self.free = list(range(old, 2 * old))[::-1]
+        return self.free.pop()
 
-        ``rows`` (l,) are theirs in the common motion's sums; ``now`` (l,) the clusters they are in, which stay unless
-        others are clearly likelier.
+    def leave(self, seats: IntArray) -> None:
+        """These flowers are no more."""
+        if len(seats):
+            self.counts[seats], self.counts[:, seats] = 0.0, 0.0
+            self.motion.clear(seats)
+            self.free += seats.tolist()
+
+    def observe(self, rows: IntArray, u: Array, var: Array) -> None:
+        """Flowers (q,) were seen in one frame, displaced by u (q, 3), variances (q,) along an axis."""
+        self.motion.observe(rows, u, var)
+        self.counts[rows[:, None], rows] += 1.0
+
+    def together(self, a: int, b: int) -> tuple[float, float]:
+        """Frames that saw both, and frames that saw the rarer one."""
+        return float(self.counts[a, b]), float(min(self.counts[a, a], self.counts[b, b]))
+
+    def group(self, rows: IntArray, places: Array, now: IntArray, volume: float, rng: np.random.Generator) -> IntArray:
+        """Cluster 0..c-1 of each flower (l,), by their seats (l,).
+
+        ``now`` (l,) are the clusters that they are in, which stay unless others are clearly likelier.
         """
         n = len(places)
         if self.config.method == "none" or n < 2:
             return np.arange(n)
-        presence = self._presence(ids)
+        counts = self.counts[rows[:, None], rows]
         if self.config.method != "spacing":
-            return group_flowers(places, presence, None, volume, self.config, rng=rng)
+            return group_flowers(places, csr_matrix(counts > 0), None, volume, self.config, rng=rng)
         now = np.unique(now, return_inverse=True)[1]
-        return self._by_spacing(places, self.motion.factor(rows), presence, volume, now)
+        return self._by_spacing(places, self.motion.factor(rows), counts, volume, now)
 
     def group_new(self, places: Array, volume: float) -> IntArray:
         """Cluster 0..c-1 of flowers (l,) that have all just been seen for the first time, together."""
@@ -101,11 +128,9 @@ class OnlineGrouping:
         if self.link > 0.0 or n < _FEWEST:
             tree = linkage(places, "average")
             return np.unique(fcluster(tree, self.link, "distance"), return_inverse=True)[1]
-        return self._by_spacing(places, np.ones((n, n)), csr_matrix(np.ones((n, 1))), volume, None)
+        return self._by_spacing(places, np.ones((n, n)), np.ones((n, n)), volume, None)
 
-    def _by_spacing(
-        self, places: Array, factor: Array, presence: csr_matrix, volume: float, now: IntArray | None
-    ) -> IntArray:
+    def _by_spacing(self, places: Array, factor: Array, counts: Array, volume: float, now: IntArray | None) -> IntArray:
         n = len(places)
         distance = np.linalg.norm(places[:, None] - places[None], axis=-1)
         apart = distance + np.diag(np.full(n, np.inf))
@@ -114,7 +139,7 @@ class OnlineGrouping:
         tree = linkage(squareform(0.5 * (distance + distance.T), checks=False), "average")
         volume = _whole_volume(places, volume)
         label, score = likeliest_cut(tree, places, volume, 0.7 * spacing)
-        if not come_in_clusters(apart.argmin(0), presence, label):
+        if not come_in_clusters(apart.argmin(0), counts, label):
             self.link = 0.0
             return np.arange(n)
         cut = n - 1 - int(label.max())  # merges below the cut
@@ -123,18 +148,6 @@ class OnlineGrouping:
         if now is None or (factor[now[:, None] == now] > _TORN).any():
             return label
         return label if score > partition_score(now, places, volume, 0.7 * spacing) + _CLEARLY else now
-
-    def _presence(self, ids: IntArray) -> csr_matrix:
-        order = np.argsort(ids)
-        rows, cols = [], []
-        for i, seen in enumerate(self.looks):
-            at = np.minimum(np.searchsorted(ids[order], seen), len(ids) - 1)
-            known = ids[order[at]] == seen
-            rows.append(order[at[known]])
-            cols.append(np.full(int(known.sum()), i))
-        r = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
-        c = np.concatenate(cols) if cols else np.zeros(0, dtype=np.int64)
-        return csr_matrix((np.ones(len(r)), (r, c)), shape=(len(ids), max(len(self.looks), 1)))
 
 
 def _whole_volume(places: Array, volume: float) -> float:
@@ -189,12 +202,15 @@ def _score(n: int, c: int, square: float, logs: float, factorials: float, volume
     return float(scatter - c * np.log(volume) + n * np.log(n / c) - n - factorials)
 
 
-def come_in_clusters(nearest: IntArray, presence: csr_matrix, label: IntArray) -> bool:
-    """Whether these flowers come in clusters at all: some have three members, and neighbours are seen together."""
+def come_in_clusters(nearest: IntArray, counts: Array, label: IntArray) -> bool:
+    """Whether these flowers come in clusters at all: some have three members, and neighbours are seen together.
+
+    ``nearest`` (l,) is each one's neighbour, ``counts`` (l, l) how many frames saw both.
+    """
     if np.bincount(label).max() < _FEWEST:
         return False
-    both = np.asarray(presence.multiply(presence[nearest]).sum(axis=1)).ravel()
-    count = np.asarray(presence.sum(axis=1)).ravel()
-    fewer = np.minimum(count, count[nearest])
-    enough = fewer >= min(_ENOUGH_LOOKS, presence.shape[1])
-    return not enough.any() or bool(np.median(both[enough] / fewer[enough]) > 0.3)
+    each = np.diag(counts)
+    fewer = np.minimum(each, each[nearest])
+    enough = fewer >= min(_ENOUGH_LOOKS, float(fewer.max()))
+    both = counts[np.arange(len(nearest)), nearest]
+    return bool(np.median(both[enough] / np.maximum(fewer[enough], 1.0)) > 0.3)

@@ -76,3 +76,9 @@ def solve_pose(
     shift = (cov @ ((B @ z_others[..., None])[..., 0] - b)[..., None])[..., 0]
     shift_cov = cov + mean_J @ others @ np.swapaxes(mean_J, 1, 2)
     return PoseSolution(z, np.linalg.inv(H), seen, shift, 0.5 * (shift_cov + np.swapaxes(shift_cov, 1, 2)), weight)
+
+
+def no_pose(cov: Array) -> PoseSolution:
+    """What is known of the pose where no flower was seen: nothing new."""
+    none: IntArray = np.zeros(0, dtype=np.int64)
+    return PoseSolution(np.zeros(6), cov, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))

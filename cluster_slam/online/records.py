@@ -8,6 +8,7 @@ from typing import Literal
 from cluster_slam.geometry import Array
 from cluster_slam.records import IntArray, State
 
+Subject = Literal["cluster", "flower", "hand_eye"]
 RevisionKind = Literal["confirmed", "lost", "returned", "merged", "moved", "forgotten", "undone", "calibrated"]
 
 
@@ -16,7 +17,7 @@ class Revision:
     """Something that is known better than a frame ago: ids of clusters (or flowers) before and after, and why."""
 
     kind: RevisionKind
-    subject: Literal["cluster", "flower", "hand_eye"]
+    subject: Subject
     before: int
     after: int
     reason: str

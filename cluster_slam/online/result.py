@@ -41,7 +41,7 @@ def make_result(session: Session, tracker: OnlineTracker, told: Told, timings: d
             covs=told.drift["cov"].astype(np.float64),
         ),
         calibration=_calibration(tracker),
-        diagnostics=Diagnostics(nis=nis, reasons=reasons, estimated_noise=tracker.estimated_noise()),
+        diagnostics=Diagnostics(nis=nis, reasons=reasons, estimated_noise={}),
         command="track",
         config=asdict(tracker.config),
         timings_s=timings,
@@ -51,29 +51,29 @@ def make_result(session: Session, tracker: OnlineTracker, told: Told, timings: d
             "flowers": len(flowers),
             "clusters": len(clusters),
             "clutter": int((flower_ids < 0).sum()),
-            "merged": len(tracker.merged),
+            "merged": len(tracker.world.merged),
             "revisions": len(told.revisions),
         },
         warnings=tuple(dict.fromkeys(warnings)),
-        merged=tuple(tracker.merged),
+        merged=tuple(tracker.world.merged),
         status="poor" if _shortcomings(flower_ids) else "ok",
     )
 
 
 def _tables(session: Session, tracker: OnlineTracker, flower_ids: IntArray) -> tuple[Flowers, Clusters]:
     """The confirmed flowers and their clusters, in the order of their ids."""
-    table = tracker.flowers
+    table = tracker.world.flowers
     rows = np.flatnonzero(table.confirmed)
     rows = rows[np.argsort(table.ids[rows])]
     ids = table.ids[rows]
-    names = np.array([k.id for k in tracker.clusters], dtype=np.int64)
+    names = np.array([k.id for k in tracker.world.clusters], dtype=np.int64)
     used, cluster = np.unique(names[table.slot[rows]], return_inverse=True)
     frames = sort_by_frame(session.observations, session.stamps)
     rest = RestMap(
         table.place[rows], tracker.joint_cov(rows), cluster, _rows_of(flower_ids[frames.order], ids, tracker)
     )
     flowers = flower_table(rest, frames)
-    slot_of = {k.id: k for k in tracker.clusters}
+    slot_of = {k.id: k for k in tracker.world.clusters}
     clusters = cluster_table(rest, frames, np.ones(len(used), dtype=bool))
     states: tuple[State, ...] = tuple(slot_of[i].state for i in used.tolist())
     first, last = table.first[rows], table.last[rows]
@@ -89,7 +89,7 @@ def _tables(session: Session, tracker: OnlineTracker, flower_ids: IntArray) -> t
 
 def _rows_of(labels: IntArray, ids: IntArray, tracker: OnlineTracker) -> IntArray:
     """Row among ``ids`` of each label (m,), merged ones by what they became; -1 for those that are no more."""
-    into = dict(tracker.merged)
+    into = dict(tracker.world.merged)
     known = np.unique(labels)
     final = []
     for label in known.tolist():

@@ -21,7 +21,7 @@ _FEW = 0.55  # a cluster that keeps fewer of its expected flowers is in trouble 
 _POOR_CHI2 = 7.0  # ... or whose flowers fit so badly on average (3 degrees of freedom)
 _UNLIKELY_JUMP = -6.0  # log-likelihood that a touch happens now
 _RECENT_S = 0.17  # unseen for longer: it may have gone farther
-_TRIED = 3  # hypotheses that are refined
+_TRIED = 2  # hypotheses that are refined
 _MOST_POINTS = 60  # free points that are tried: more of them are a flood, not flowers
 
 
@@ -71,7 +71,7 @@ def find_moved(scene: Scene, matches: Matches, config: TemplateConfig) -> dict[i
     found: dict[int, Moved] = {}
     if not troubled.any() or not 2 <= free.sum() <= _MOST_POINTS:
         return found
-    waiting = {int(j): _best(int(j), scene, free, config) for j in np.flatnonzero(troubled)}
+    waiting = {j: _best(j, scene, free, config) for j in _promising(scene, troubled, free, kept, config)}
     while waiting:
         j = max(waiting, key=lambda k: (waiting[k].score, -k))
         best = waiting.pop(j)
@@ -83,6 +83,18 @@ def find_moved(scene: Scene, matches: Matches, config: TemplateConfig) -> dict[i
             if not free[other.cols].all():
                 waiting[k] = _best(k, scene, free, config)
     return found
+
+
+def _promising(scene: Scene, troubled: BoolArray, free: BoolArray, kept: IntArray, config: TemplateConfig) -> list[int]:
+    """Clusters in trouble that have more free points about them than they kept."""
+    flowers = np.flatnonzero(troubled[scene.slot])
+    slot = scene.slot[flowers]
+    reach = np.where(scene.unseen_s[slot] < _RECENT_S, config.reach_m, config.reach_unseen_m)
+    gap = scene.w[free][None] - scene.places[flowers][:, None]
+    near = np.einsum("fpi,fpi->fp", gap, gap) < (reach**2)[:, None]
+    about = np.zeros((len(troubled), int(free.sum())), dtype=bool)
+    np.logical_or.at(about, slot, near)
+    return [int(j) for j in np.flatnonzero(troubled & (about.sum(1) > np.maximum(kept, 1)))]
 
 
 def with_moved(matches: Matches, found: dict[int, Moved], slot: IntArray, n_points: int) -> Matches:

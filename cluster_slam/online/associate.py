@@ -1,0 +1,122 @@
+"""Which confirmed flower each point of a frame shows, clusters that were touched included, and the frame's pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cluster_slam.association.frames import information, point_jacobian
+from cluster_slam.geometry import Array, se3_exp, transform
+from cluster_slam.online.matching import Matches, match
+from cluster_slam.online.pose import PoseSolution, no_pose, solve_pose
+from cluster_slam.online.search import Scene, find_moved, with_moved
+from cluster_slam.online.world import Snapshot, World
+from cluster_slam.records import IntArray
+
+_NEAR_VIEW = 0.15  # of x / z: moving clusters so far outside of the view are still followed
+_VIEW = 0.02
+_LONG_S = 0.5  # a cluster unseen for longer is searched for ...
+_SOMETIMES = 5  # ... in one of so many frames
+_JUMP_SIGMA_M = 0.005  # of a displacement that the search has found, before the frame's own pose is known
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """One frame's points: ``c`` (q, 3) camera, ``S`` (q, 3, 3) world, with the pose as predicted and its covariance."""
+
+    T: Array
+    cov: Array
+    c: Array
+    S: Array
+    stamp: float
+    number: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """Confirmed flowers (q,) rows and points (q,) that belong together, and the frame's pose."""
+
+    rows: IntArray
+    cols: IntArray
+    chi2: Array
+    pose: PoseSolution
+    at: Snapshot
+
+
+def associate(world: World, view: View, cov_hand_eye: Array) -> Seen:
+    """Match, find the pose, match again, search for what was touched, and find the pose of all that."""
+    table, config = world.flowers, world.config
+    predict_moving(world, view)
+    rows = np.flatnonzero(table.confirmed)
+    at = world.snapshot(view.stamp)
+    J = point_jacobian(view.T[:3, :3], view.c)
+    cov_z = view.cov + cov_hand_eye
+    prior = np.asarray(np.linalg.inv(cov_z), np.float64)
+    w = transform(view.T, view.c)
+    place_cov = table.cov[rows] + config.slack_m**2 * np.eye(3)
+    predicted = world.expected(rows, at)
+    P = at.P[table.slot[rows]] + place_cov
+    found = match(predicted, P, w, view.S + J @ cov_z @ np.swapaxes(J, 1, 2), config.gate_chi2)
+
+    def pose_of(m: Matches) -> PoseSolution:
+        if not len(m.rows):
+            return no_pose(cov_z)
+        W = information(view.S[m.cols] + place_cov[m.rows])
+        slot = table.slot[rows[m.rows]]
+        return solve_pose(J[m.cols], predicted[m.rows] - w[m.cols], W, slot, at.P, prior)
+
+    pose = pose_of(found)
+    moved = transform(view.T @ se3_exp(pose.z), view.c)
+    found = match(predicted, P, moved, view.S + J @ pose.cov @ np.swapaxes(J, 1, 2), config.gate_chi2)
+    better = search(world, view, rows, found, predicted, moved, at)
+    if better is not None:
+        found, at = better, world.snapshot(view.stamp)
+        predicted = world.expected(rows, at)
+    return Seen(rows[found.rows], found.cols, found.chi2, pose_of(found), at)
+
+
+def predict_moving(world: World, view: View) -> None:
+    """Bring the clusters that move, and may be seen, to the time of the frame."""
+    moving = [k for k in world.clusters if k.is_moving and k.anchor is not None]
+    if not moving:
+        return
+    anchors = np.array([k.anchor for k in moving])
+    for cluster, is_near in zip(moving, world.in_view(view.T, anchors, _NEAR_VIEW), strict=True):
+        if is_near:
+            cluster.predict(view.stamp)
+
+
+def search(
+    world: World, view: View, rows: IntArray, matches: Matches, predicted: Array, w: Array, at: Snapshot
+) -> Matches | None:
+    """Better matches, where clusters had lost their flowers and were found elsewhere; None where none was."""
+    if not len(rows) or not len(w):
+        return None
+    table = world.flowers
+    slots = table.slot[rows]
+    turn = (np.arange(len(world.clusters)) + view.number) % _SOMETIMES == 0
+    looked = world.in_view(view.T, predicted, _VIEW) & ((at.unseen_s < _LONG_S) | turn)[slots]
+    looked[matches.rows] = True
+    flowers = np.flatnonzero(looked)
+    index = np.full(len(rows), -1)
+    index[flowers] = np.arange(len(flowers))
+    scene = Scene(table.place[rows[flowers]], slots[flowers], w, view.S, at.d, at.P, at.unseen_s)
+    before = replace(matches, rows=index[matches.rows])
+    found = find_moved(scene, before, world.config.follow)
+    if not found:
+        return None
+    for slot, moved in found.items():
+        if moved.is_jump:
+            jump(world, slot, moved.d, at, view.stamp)
+    after = with_moved(before, found, slots[flowers], len(w))
+    return replace(after, rows=flowers[after.rows])
+
+
+def jump(world: World, slot: int, d: Array, at: Snapshot, stamp: float) -> None:
+    """A cluster was found where nobody would have predicted it: it is followed from there."""
+    cluster, velocity = world.clusters[slot], None
+    if at.unseen_s[slot] < 1.5 * world.usual_dt:
+        velocity = cluster.velocity + (d - at.d[slot]) / max(at.unseen_s[slot], 1e-6)
+    cov, speed = _JUMP_SIGMA_M**2 * np.eye(3), world.config.follow.jump_speed
+    cluster.jump(d, cov, speed, velocity, "it was found elsewhere, by its shape", stamp)

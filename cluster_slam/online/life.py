@@ -1,0 +1,204 @@
+"""The life of flowers: born of points that nobody claims, confirmed when seen M times of N, forgotten when not found.
+
+A miss counts only where the flower was in view, one of its cluster was seen, and nothing stood before it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cluster_slam.association.frames import information, point_jacobian
+from cluster_slam.geometry import Array, inverse, transform
+from cluster_slam.online.associate import Seen, View
+from cluster_slam.online.matching import match
+from cluster_slam.online.world import Snapshot, World
+from cluster_slam.records import BoolArray, IntArray, RejectReason
+from tracking.gating import chi2_threshold
+
+_KEEP = 0.998  # of the count of looks, from look to look
+_VIEW = -0.02  # at the rim of the view nothing is a miss
+_MANY = 2.0  # times as many new points as false ones are usual: then they are flowers, at once
+_GHOST_LOOKS = 15  # looks at a landmark before it can be found to be none ...
+_GHOST_SHARE = 0.3  # ... seen in so small a share of them, compared with the others
+_FLOWER_SHARE = 0.3  # radius of a flower over how close they stand
+
+
+def live(world: World, seen: Seen, view: View, T: Array, w: Array) -> tuple[IntArray, IntArray]:
+    """Flower id of each point (q,), -1 for none, and the reason (q,) of each."""
+    table = world.flowers
+    row_of = np.full(len(w), -1, dtype=np.int64)
+    row_of[seen.cols] = seen.rows
+    match_tentative(world, seen, view, T, w, row_of)
+    count_hits(world, row_of[row_of >= 0], view.stamp)
+    count_misses(world, seen.at, T, view.c, row_of[row_of >= 0])
+    note_motion(world, seen, w, view.S, view.number)
+    reasons = np.where(row_of >= 0, int(RejectReason.ACCEPTED), int(RejectReason.POSITION_GATE))
+    n_born = bear(world, seen, view, T, w, row_of, reasons)
+    shown = row_of >= 0
+    young = shown & (table.n[row_of] < 2)
+    if n_born <= _MANY * world.clutter_rate:
+        shown &= ~young
+    reasons[young & ~shown] = int(RejectReason.UNCONFIRMED)
+    confirm(world, view.stamp)
+    return np.where(shown, table.ids[row_of] if len(table) else -1, -1), reasons
+
+
+def match_tentative(world: World, seen: Seen, view: View, T: Array, w: Array, row_of: IntArray) -> None:
+    """What is left may be tentative flowers, displaced as their cluster is; fills ``row_of`` (q,)."""
+    table = world.flowers
+    left, tentative = np.flatnonzero(row_of < 0), np.flatnonzero(~table.confirmed)
+    if not (len(left) and len(tentative)):
+        return
+    slot = table.slot[tentative]
+    slack = world.config.slack_m**2 * np.eye(3)
+    J = point_jacobian(T[:3, :3], view.c[left])
+    cov = view.S[left] + J @ seen.pose.cov @ np.swapaxes(J, 1, 2)
+    at = table.place[tentative] + seen.at.d[slot]
+    m = match(at, table.cov[tentative] + seen.at.P[slot] + slack, w[left], cov, world.config.gate_chi2)
+    rows, cols = tentative[m.rows], left[m.cols]
+    row_of[cols] = rows
+    P = table.cov[rows] + slack
+    gain = P @ information(P + view.S[cols])
+    table.place[rows] += (gain @ (w[cols] - seen.at.d[table.slot[rows]] - table.place[rows])[..., None])[..., 0]
+    P = P - gain @ P
+    table.cov[rows] = 0.5 * (P + np.swapaxes(P, 1, 2))
+
+
+def count_hits(world: World, hit: IntArray, stamp: float) -> None:
+    table = world.flowers
+    table.hits[hit] = (table.hits[hit] << 1) | 1
+    table.vain[hit] = 0
+    table.n[hit] += 1
+    table.last[hit] = stamp
+    table.looks[hit] = _KEEP * table.looks[hit] + 1.0
+    table.found[hit] = _KEEP * table.found[hit] + 1.0
+
+
+def count_misses(world: World, at: Snapshot, T: Array, c: Array, hit: IntArray) -> None:
+    """Count the looks in vain."""
+    table = world.flowers
+    if not len(table) or not len(c):
+        return
+    expected = world.expected(np.arange(len(table)), at)
+    missed = world.in_view(T, expected, _VIEW)
+    missed[hit] = False
+    witness = np.zeros(len(world.clusters), dtype=bool)
+    witness[table.slot[hit]] = True
+    alone = np.bincount(table.slot, minlength=len(world.clusters)) < 2
+    rows = np.flatnonzero(missed & (witness[table.slot] | alone[table.slot] | ~table.confirmed))
+    if not len(rows):
+        return
+    clear = ~is_hidden(transform(inverse(T), expected[rows]), c, _FLOWER_SHARE * min(world.spacing, 0.1))
+    rows = rows[clear]
+    table.hits[rows] <<= 1
+    table.vain[rows] += 1
+    table.looks[rows] = _KEEP * table.looks[rows] + 1.0
+    table.found[rows] *= _KEEP
+
+
+def is_hidden(p: Array, c: Array, radius: float) -> BoolArray:
+    """Which points p (k, 3) have a seen point c (q, 3) before them, camera frame; flowers have a radius, m."""
+    depth = c[:, 2]
+    across = p[:, None, :2] / p[:, None, 2:] - c[None, :, :2] / depth[None, :, None]
+    near = (across * across).sum(-1) * depth**2 < radius * radius
+    hidden: BoolArray = (near & (depth < p[:, 2:] - radius)).any(1)
+    return hidden
+
+
+def note_motion(world: World, seen: Seen, w: Array, S: Array, number: int) -> None:
+    """Who was seen together, and who moved together."""
+    if not len(seen.rows):
+        return
+    u = w[seen.cols] - world.flowers.place[seen.rows]
+    var = np.trace(S[seen.cols], axis1=1, axis2=2) / 3.0 + np.trace(seen.pose.cov[3:, 3:]) / 3.0
+    world.grouping.observe(world.flowers.seat[seen.rows], u, var)
+
+
+def bear(world: World, seen: Seen, view: View, T: Array, w: Array, row_of: IntArray, reasons: IntArray) -> int:
+    """Points that nobody claims begin tentative flowers, in the cluster next to them or in one of their own."""
+    left, known = np.flatnonzero(row_of < 0), np.flatnonzero(row_of >= 0)
+    if len(left) and len(known):
+        gap = w[left][:, None] - w[known][None]
+        cov = view.S[left][:, None] + view.S[known][None]
+        chi2 = np.einsum("abi,abij,abj->ab", gap, information(cov), gap)
+        doubled = (chi2 < chi2_threshold(3, 0.9)).any(1)
+        reasons[left[doubled]] = int(RejectReason.TAKEN)
+        left = left[~doubled]
+    if not len(left):
+        return 0
+    note_spacing(world, w)
+    slot = slots_for(world, w, left, known, row_of, view.stamp)
+    d = np.zeros((len(world.clusters), 3))
+    d[: len(seen.at.d)] = seen.at.d
+    J = point_jacobian(T[:3, :3], view.c[left])
+    cov = view.S[left] + J @ seen.pose.cov @ np.swapaxes(J, 1, 2)
+    row_of[left] = world.flowers.add(w[left] - d[slot], cov, J, slot, view.stamp)
+    world.place_anchors(np.unique(slot))
+    return len(left)
+
+
+def note_spacing(world: World, w: Array) -> None:
+    """How close flowers stand: a low quantile of the distance to the nearest of the same frame, averaged."""
+    if len(w) < 2:
+        return
+    gap = np.linalg.norm(w[:, None] - w[None], axis=-1)
+    np.fill_diagonal(gap, np.inf)
+    low = float(np.quantile(gap.min(1), 0.1))
+    world.spacing = low if not np.isfinite(world.spacing) else world.spacing + 0.05 * (low - world.spacing)
+
+
+def slots_for(world: World, w: Array, left: IntArray, known: IntArray, row_of: IntArray, stamp: float) -> IntArray:
+    """Clusters (k,) for new flowers at ``w[left]``; new clusters are made where none is near."""
+    table, link = world.flowers, world.grouping.link
+    slot = np.full(len(left), -1, dtype=np.int64)
+    if link > 0.0 and len(known):
+        gap = np.linalg.norm(w[left][:, None] - w[known][None], axis=-1)
+        near = gap.min(1) < link
+        slot[near] = table.slot[row_of[known[gap.argmin(1)]]][near]
+    if link > 0.0 and len(table):
+        gap = np.linalg.norm(w[left][:, None] - table.place[None], axis=-1)
+        near = (slot < 0) & (gap.min(1) < link)
+        slot[near] = table.slot[gap.argmin(1)][near]
+    free = np.flatnonzero(slot < 0)
+    if len(free):
+        label = world.grouping.group_new(w[left[free]], world.view_volume())
+        for k in range(int(label.max()) + 1):
+            slot[free[label == k]] = world.new_cluster(stamp)
+    return slot
+
+
+def confirm(world: World, stamp: float) -> None:
+    """M of N: tentative flowers that were seen often enough become landmarks."""
+    table, config = world.flowers, world.config
+    count = np.bitwise_count(table.hits & ((1 << config.confirm_of) - 1))
+    for row in np.flatnonzero(~table.confirmed & (count >= config.confirm_hits)).tolist():
+        table.confirmed[row] = True
+        table.seat[row] = world.grouping.sit()
+        cluster, lever = world.clusters[int(table.slot[row])], table.lever[row]
+        cov = table.cov[row] + (cluster.reach**2 + config.slack_m**2) * np.eye(3)
+        world.map.include(int(table.ids[row]), table.place[row] - lever @ world.x, cov, lever)
+        if cluster.state == "tentative":
+            cluster.state = "confirmed"
+            world.say("confirmed", "cluster", cluster.id, cluster.id, "its flowers were seen again")
+        cluster.awaken(stamp)
+        world.grouping.is_stale = True
+
+
+def forget(world: World) -> None:
+    """Remove tentative flowers looked for in vain, and landmarks that are hardly ever where they should be."""
+    table, config = world.flowers, world.config
+    if not len(table):
+        return
+    patience = np.where(table.n <= 1, config.confirm_of - config.confirm_hits, config.forget_looks)
+    gone = ~table.confirmed & (table.vain >= patience)
+    n_false = int((gone & (table.n <= 2)).sum())
+    world.clutter_rate += 0.02 * (n_false - world.clutter_rate)
+    share = table.found / np.maximum(table.looks, 1.0)
+    sure = table.confirmed & (table.looks > _GHOST_LOOKS)
+    if sure.any():
+        ghost = sure & (share < _GHOST_SHARE * float(np.median(share[sure]))) & (table.vain > 4)
+        for row in np.flatnonzero(ghost).tolist():
+            world.map.remove(int(table.ids[row]))
+            world.say("forgotten", "flower", int(table.ids[row]), -1, "it was looked for in vain")
+        gone |= ghost
+    world.drop(gone)
