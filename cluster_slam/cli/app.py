@@ -13,6 +13,7 @@ import typer
 
 from cluster_slam import __version__
 from cluster_slam.cli import (
+    calibrate,
     check,
     compare,
     detect,
@@ -72,6 +73,7 @@ app.command("check")(check.command)
 app.command("detect", short_help="Find flowers in pictures.")(detect.command)
 app.command("figures")(figures.command)
 app.command("compare-descriptors")(compare.command)
+app.command("calibrate")(calibrate.command)
 app.command("localise")(localise.command)
 app.command("record")(record.command)
 app.command("import")(importing.command)

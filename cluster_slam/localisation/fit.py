@@ -152,8 +152,8 @@ def _tie(data: Array, b: Array, shared: Array, at_rest: Array, scale: ErrorScale
     Sway is a mixture of two normal distributions: most clusters hang still, a few have just been touched.
     """
     spread: Array = _inverse(data)
-    alone = np.linalg.solve(data, -b[..., None])[..., 0]
-    touched = shared + scale.touched_m**2 * np.eye(3)
+    alone: Array = np.asarray(np.linalg.solve(data, -b[..., None])[..., 0], dtype=np.float64)
+    touched: Array = shared + scale.touched_m**2 * np.eye(3)
     log_calm = matching_log_likelihood(alone, shared + spread) + np.log1p(-scale.touched_share)
     log_touched = matching_log_likelihood(alone, touched + spread) + np.log(scale.touched_share)
     share = 1.0 / (1.0 + np.exp(np.clip(log_calm - log_touched, -50.0, 50.0)))[:, None, None]
@@ -163,8 +163,7 @@ def _tie(data: Array, b: Array, shared: Array, at_rest: Array, scale: ErrorScale
 
 def _inverse(covs: Array) -> Array:
     """Inverses of a stack (c, 3, 3)."""
-    out: Array = np.linalg.solve(covs, np.broadcast_to(np.eye(3), covs.shape))
-    return out
+    return np.asarray(np.linalg.solve(covs, np.broadcast_to(np.eye(3), covs.shape)), dtype=np.float64)
 
 
 def _sums(values: Array, group: IntArray, n: int) -> Array:

@@ -1,0 +1,258 @@
+"""Calibration of the camera's mounting on the flange, to be read like the method section of a paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from cluster_slam.errors import InputError
+from cluster_slam.geometry import Array, inverse, so3_log, transform
+from cluster_slam.graph.calibration import (
+    Mounting,
+    StillPoints,
+    larger,
+    motion_pairs,
+    park_martin,
+    refine_mounting,
+)
+from cluster_slam.graph.noise import pose_model
+from cluster_slam.pipeline.smooth import smooth
+from cluster_slam.records import CLUTTER, IntArray, Result, Session
+from cluster_slam.sensors.interpolation import interpolate
+
+Progress = Callable[[str, float], None]
+TIME_SIGMA_S = 0.1  # how far the clocks may be apart, one sigma
+SCALE_SIGMA = 0.05  # of the depth scale
+_POOR_SHIFT_M = 0.005  # a direction of the shift that is known no better is worth a word ...
+_POOR_TURN_RAD = 0.009  # ... and so is a turn
+_STILL_RAD = 0.03  # root mean square turn below which the flange has not turned about an axis
+_AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationReport:
+    """What was found, how sure it is, and what would make it surer."""
+
+    session: Session
+    mounting: Mounting
+    excitation_rad: Array  # (3,) root mean square turn about each axis of the flange
+    advice: tuple[str, ...]
+    unobserved: tuple[str, ...]
+    source: Literal["flowers", "board"]
+    n_used: int
+    with_time: bool = False
+    with_scale: bool = False
+    warnings: tuple[str, ...] = ()
+    status: Literal["ok", "poor"] = "ok"
+    timings_s: dict[str, float] = field(default_factory=dict)
+
+
+def calibrate(
+    session: Session,
+    *,
+    time_offset: bool = False,
+    depth_scale: bool = False,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> CalibrationReport:
+    """The hand-eye transform of a session from its flowers, whoever they are.
+
+    Parameters
+    ----------
+    session : with poses of the flange.
+    time_offset : find the offset between the clocks of arm and camera too.
+    depth_scale : find the scale of the distances too.
+    seed : of what is random.
+    progress : called with the stage in words and a fraction 0..1.
+
+    Raises
+    ------
+    InputError
+        Poses are not the flange's, or there is nothing to calibrate by.
+    """
+    _check(session)
+    say = progress or (lambda _stage, _fraction: None)
+    say("who is who", 0.0)
+    result = smooth(session, seed=seed, progress=lambda stage, share: say(stage, 0.45 * share))
+    seen, mounting = _refined(session, result, time_offset, depth_scale)
+    if time_offset or depth_scale:
+        corrected = _corrected(session, mounting)
+        again = smooth(corrected, seed=seed, progress=lambda stage, share: say(stage, 0.5 + 0.45 * share))
+        seen, rest = _refined(corrected, again, time_offset, depth_scale)
+        mounting = replace(
+            rest,
+            time_offset_s=mounting.time_offset_s + rest.time_offset_s,
+            depth_scale=mounting.depth_scale * rest.depth_scale,
+        )
+        result = again
+    if result.calibration is not None and not (time_offset or depth_scale):
+        mounting = replace(
+            mounting, X=result.calibration.T_flange_camera, cov=larger(mounting.cov, result.calibration.cov)
+        )
+    unobserved = () if result.calibration is None else result.calibration.unobserved
+    return report_on(session, mounting, len(seen.points), unobserved, "flowers", time_offset, depth_scale)
+
+
+def calibrate_by_board(
+    session: Session,
+    frame: IntArray,
+    label: IntArray,
+    points: Array,
+    var: Array,
+    board: Array,
+    *,
+    time_offset: bool = False,
+    depth_scale: bool = False,
+) -> CalibrationReport:
+    """The hand-eye transform from a board at rest.
+
+    Parameters
+    ----------
+    session : with poses of the flange.
+    frame, label : (q,) of each corner seen: frame and which corner.
+    points : (q, 3) camera, m.
+    var : (q,) m^2 an axis.
+    board : (n, 4, 4) ``T_camera_board`` of each frame, NaN where it was not seen.
+    """
+    _check(session, "board")
+    there = np.flatnonzero(np.isfinite(board).all((1, 2)))
+    if len(there) < 3:
+        raise InputError(f"the board was found in {len(there)} pictures, expected at least 3")
+    pairs = there[motion_pairs(session.poses[there])]
+    if len(pairs) < 2:
+        raise InputError("the arm hardly turned while it saw the board: turn it about two axes, 20 degrees or more")
+    flange = inverse(session.poses[pairs[:, 0]]) @ session.poses[pairs[:, 1]]
+    camera = board[pairs[:, 0]] @ inverse(board[pairs[:, 1]])
+    X = park_martin(flange, camera)
+    model = pose_model(session)
+    seen = _still_points(session, frame, points, var, label)
+    mounting = refine_mounting(
+        seen,
+        X,
+        100.0 * np.eye(6) if model.X0 is None else model.cov_hand_eye + 100.0 * np.eye(6),
+        time_sigma_s=TIME_SIGMA_S if time_offset else None,
+        scale_sigma=SCALE_SIGMA if depth_scale else None,
+        start=X,
+    )
+    return report_on(session, mounting, len(points), (), "board", time_offset, depth_scale)
+
+
+def _check(session: Session, source: Literal["flowers", "board"] = "flowers") -> None:
+    if session.T_flange_camera is None:
+        raise InputError(
+            f"session {session.id!r} has poses of the camera, expected poses of the flange "
+            '(frames.pose = "T_world_flange") to calibrate the mounting'
+        )
+    if session.pose_error == "odometry":
+        raise InputError(f"session {session.id!r} has poses from odometry, expected an arm's absolute poses")
+    if source == "flowers" and len(session.observations) == 0:
+        raise InputError(f"session {session.id!r} shows no flowers, expected some to calibrate by")
+
+
+def _refined(session: Session, result: Result, time_offset: bool, depth_scale: bool) -> tuple[StillPoints, Mounting]:
+    """The mounting under which the flowers that were found stand still."""
+    o = session.observations
+    rows = np.flatnonzero(result.flower_ids != CLUTTER)
+    if len(rows) < 6:
+        raise InputError(f"only {len(rows)} observations could be told apart, expected more to calibrate by")
+    _, label = np.unique(result.flower_ids[rows], return_inverse=True)
+    model = pose_model(session)
+    X = session.T_flange_camera if result.calibration is None else result.calibration.T_flange_camera
+    begin = model.X0 if X is None else X
+    if begin is None or model.X0 is None:
+        raise InputError(f"session {session.id!r} has no hand-eye transform to begin with")
+    lever = np.linalg.norm(transform(begin, o.points[rows]), axis=1)
+    var = np.trace(o.covs[rows], axis1=1, axis2=2) / 3.0 + model.cov[3, 3] + model.cov[0, 0] * lever**2
+    seen = _still_points(session, o.frame[rows], o.points[rows], var, label.astype(np.int64))
+    mounting = refine_mounting(
+        seen,
+        model.X0,
+        model.cov_hand_eye,
+        start=begin,
+        time_sigma_s=TIME_SIGMA_S if time_offset else None,
+        scale_sigma=SCALE_SIGMA if depth_scale else None,
+    )
+    return seen, mounting
+
+
+def _still_points(session: Session, frame: IntArray, points: Array, var: Array, label: IntArray) -> StillPoints:
+    def flange_at(offset: float) -> Array:
+        if offset == 0.0:
+            return session.poses[frame]
+        return interpolate(session.stamps, session.poses, session.stamps + offset)[frame]
+
+    return StillPoints(flange_at, points, var, label, session.stamps[frame])
+
+
+def _corrected(session: Session, mounting: Mounting) -> Session:
+    """The session with the offset of the clocks and the depth scale taken out."""
+    poses = interpolate(session.stamps, session.poses, session.stamps + mounting.time_offset_s)
+    o = session.observations
+    scaled = replace(o, points=o.points * mounting.depth_scale, covs=o.covs * mounting.depth_scale**2)
+    return replace(session, poses=poses, observations=scaled)
+
+
+def report_on(
+    session: Session,
+    mounting: Mounting,
+    n_used: int,
+    unobserved: tuple[str, ...],
+    source: Literal["flowers", "board"],
+    with_time: bool,
+    with_scale: bool,
+) -> CalibrationReport:
+    """What was found with what it is worth, and advice."""
+    turns = so3_log(inverse(session.poses[:1])[:, :3, :3] @ session.poses[:, :3, :3])
+    excitation = np.sqrt((turns - turns.mean(0)).var(0))
+    advice = _advice(mounting.cov[:6, :6], excitation)
+    prior = pose_model(session).cov_hand_eye
+    learnt = np.trace(mounting.cov[:6, :6] @ np.linalg.solve(prior, np.eye(6))) / 6.0
+    still = bool((excitation < _STILL_RAD).all())
+    warnings = list(session.warnings)
+    status: Literal["ok", "poor"] = "ok"
+    if still or learnt > 0.5 or len(unobserved) >= 3:
+        status = "poor"
+        warnings.append("the motions say little of the mounting" + ("; the arm did not turn" if still else ""))
+    return CalibrationReport(
+        session,
+        mounting,
+        excitation,
+        advice,
+        unobserved,
+        source,
+        n_used,
+        with_time,
+        with_scale,
+        tuple(warnings),
+        status,
+    )
+
+
+def _advice(cov: Array, excitation: Array) -> tuple[str, ...]:
+    """Which motions are missing, in words."""
+    words = []
+    for a in np.flatnonzero(excitation < _STILL_RAD).tolist():
+        turned = np.degrees(excitation[a])
+        words.append(f"turn the flange about its {_AXES[a]} axis by 20 degrees or more (so far {turned:.1f} RMS)")
+    shifts, axes = np.linalg.eigh(cov[3:, 3:])
+    for value, axis in zip(shifts, axes.T, strict=True):
+        if np.sqrt(value) > _POOR_SHIFT_M:
+            known = f"the camera's place along {_named(axis)} is known to {1e3 * np.sqrt(value):.1f} mm only"
+            words.append(f"{known}: turn about axes across it")
+    turns, axes = np.linalg.eigh(cov[:3, :3])
+    for value, axis in zip(turns, axes.T, strict=True):
+        if np.sqrt(value) > _POOR_TURN_RAD:
+            words.append(
+                f"the camera's turn about {_named(axis)} is known to {np.degrees(np.sqrt(value)):.2f} degrees only: "
+                "turn and move more, and look at flowers farther apart"
+            )
+    return tuple(words)
+
+
+def _named(axis: Array) -> str:
+    """A direction by the axes of the camera."""
+    parts = [f"{abs(v):.1f} {n}" for v, n in zip(axis.tolist(), _AXES, strict=True) if abs(v) > 0.3]
+    return "the camera's " + (_AXES[int(np.abs(axis).argmax())] if np.abs(axis).max() > 0.9 else " + ".join(parts))
