@@ -14,7 +14,8 @@ from cluster_slam.constellation.match import Match, match
 from cluster_slam.geometry import Array
 from cluster_slam.records import Constellation, PlantMap
 
-SURPRISE = 3.0  # log odds of "a plant that the map does not have" before looking
+FAMILIAR = 2.0  # log odds of a plant that the map has, before looking: most sessions show one
+REPEATED = 0.5  # a rival that explains more than this share of the best evidence is a clone, or a repeated structure
 
 
 class Refusal(StrEnum):
@@ -68,8 +69,8 @@ def _probabilities(matches: list[Match]) -> Array:
     """Posterior of each match's best pose among all poses of all plants, and none."""
     if not matches:
         return np.zeros(0)
-    each = np.array([m.evidence for m in matches]) - SURPRISE - np.log(len(matches))
-    others = np.array([m.runner_up for m in matches]) - SURPRISE - np.log(len(matches))
+    each = np.array([m.evidence for m in matches]) + FAMILIAR - np.log(len(matches))
+    others = np.array([m.runner_up for m in matches]) + FAMILIAR - np.log(len(matches))
     total = np.logaddexp.reduce(np.concatenate([[0.0], each, others]))
     posterior: Array = np.exp(each - total)
     return posterior
@@ -88,10 +89,11 @@ def _refusal(
     rivals = [(f"another pose on {best.name}", best.runner_up), *((m.name, m.evidence) for m in matches[1:])]
     rival, score = max(rivals, key=lambda r: r[1])
     fits = f"{best.name} fits with a log Bayes factor of {best.evidence:.1f}"
-    if best.evidence >= wanted and best.evidence - score >= options.margin:
+    margin = max(options.margin, REPEATED * best.evidence)
+    if best.evidence >= wanted and best.evidence - score >= margin:
         return Refusal.NONE, fits
     if best.evidence >= wanted:
-        text = f"ambiguous: {fits}, {rival} with {score:.1f}; they must differ by {options.margin:g}"
+        text = f"ambiguous: {fits}, {rival} with {score:.1f}; they must differ by {margin:.1f}"
         return Refusal.AMBIGUOUS, text
     if best.is_repeated:
         text = f"ambiguous: the clusters' layout fits {best.name} in several ways, and their flowers none well"
