@@ -99,16 +99,23 @@ def calibrate_pictures(
                 continue
             if spec.kind == "charuco" or not np.isfinite(poses[i]).all():
                 poses[i] = T
-            seen.append(
-                (i, label, transform(T, corners), np.full(len(label), _variance(camera, T, corners, session)), T)
-            )
+            var = np.full(len(label), _variance(camera, T, corners, session))
+            seen.append((i, label, transform(T, corners), var))
     if not seen:
         raise InputError(f"{path / 'rgb.txt'}: the board {board} was found in none of {len(names)} pictures")
     frame = np.concatenate([np.full(len(label), i) for i, label, _, _ in seen])
     _, label = np.unique(np.concatenate([s[1] for s in seen]), return_inverse=True)
-    points, var = (np.concatenate([s[k] for s in seen]) for k in (2, 3))
+    points = np.concatenate([s[2] for s in seen])
+    variances = np.concatenate([s[3] for s in seen])
     return calibrate_by_board(
-        session, frame, label.astype(np.int64), points, var, poses, time_offset=time_offset, depth_scale=depth_scale
+        session,
+        frame,
+        label.astype(np.int64),
+        points,
+        variances,
+        poses,
+        time_offset=time_offset,
+        depth_scale=depth_scale,
     )
 
 
