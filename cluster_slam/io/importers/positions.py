@@ -236,14 +236,20 @@ def _as_positions(path: Path, name: str, value: Any) -> Positions | None:
 
 
 def _cells(cells: list[Any]) -> Positions | None:
-    """One matrix (n, 3) a frame, or (3, n); empty ones are frames without flowers."""
+    """One matrix (n, 3) a frame, or (3, n); empty ones are frames without flowers.
+
+    A (3, 3) is read as the others are, by rows where they do not say.
+    """
     points, frames = [], []
+    is_columns = any(cell.ndim == 2 and cell.shape[0] == 3 != cell.shape[1] and cell.size for cell in cells)
     for k, cell in enumerate(cells):
         if not cell.size:
             continue
         if cell.ndim != 2 or cell.dtype.kind not in "fiu" or 3 not in cell.shape:
             return None
-        rows = (cell if cell.shape[1] == 3 else cell.T).astype(float)
+        rows = (cell.T if is_columns else cell).astype(float)
+        if rows.shape[1] != 3:
+            return None
         rows = rows[np.isfinite(rows).all(axis=1)]
         points.append(rows)
         frames.append(np.full(len(rows), k, dtype=np.int64))
