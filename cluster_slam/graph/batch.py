@@ -41,6 +41,13 @@ class Pairs:
     stretch: IntArray
     stretch_sigma: Array
 
+    @property
+    def total_sigma(self) -> Array:
+        """How far each cluster (p,) may be from rest, its stretch and itself together, m."""
+        if len(self.stretch_sigma) == 0:
+            return self.sigma
+        return np.hypot(self.sigma, np.where(self.stretch >= 0, self.stretch_sigma[self.stretch], 0.0))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseModel:

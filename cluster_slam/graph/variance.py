@@ -86,7 +86,7 @@ def _frame_redundancy(
     data = np.einsum("qia,qib->ab", J, J)
     N = data.copy()
     N[:6, :6] += prior
-    N[range(6, len(N)), range(6, len(N))] += np.repeat(smoother.pairs.sigma[pairs] ** -2, 3)
+    N[range(6, len(N)), range(6, len(N))] += np.repeat(smoother.pairs.total_sigma[pairs] ** -2, 3)
     posterior = np.linalg.inv(N)
     return 3.0 * q - float((posterior * data).sum()), posterior
 
@@ -102,31 +102,11 @@ def _correlation_factor(smoother: BatchSmoother, residual: Array, used: BoolArra
     at = (smoother.frame[used], smoother.landmark[used])
     series[at] = residual[used]
     seen[at] = 1.0
-    return _integrated_autocorrelation(series, seen, noise_free=False)
+    return _integrated_autocorrelation(series, seen)
 
 
-def displacement_correlation(smoother: BatchSmoother, estimate: Estimate) -> float:
-    """How many displacements of one cluster in a row count as one: sway is slow compared with the frames.
-
-    White displacements of that many times the variance have the same density at frequency zero, which is what a place
-    at rest is estimated from.
-    """
-    pairs = smoother.pairs
-    if len(pairs.frame) == 0:
-        return 1.0
-    n, n_clusters = len(estimate.T), int(pairs.cluster.max()) + 1
-    series = np.zeros((n, n_clusters, 3))
-    seen = np.zeros((n, n_clusters))
-    series[pairs.frame, pairs.cluster] = estimate.d / pairs.sigma[:, None]
-    seen[pairs.frame, pairs.cluster] = 1.0
-    return _integrated_autocorrelation(series, seen, noise_free=True)
-
-
-def _integrated_autocorrelation(series: Array, seen: Array, noise_free: bool) -> float:
-    """1 + 2 sum of the autocorrelation of series (n, s, 3), zero where not ``seen``, to the lag at which it is lost.
-
-    ``noise_free``: measurement noise, which is in lag zero only, does not count as part of the series.
-    """
+def _integrated_autocorrelation(series: Array, seen: Array) -> float:
+    """1 + 2 sum of the autocorrelation of series (n, s, 3), zero where not ``seen``, to the lag at which it is lost."""
     n = len(series)
     power = float((series**2).sum() / max(3.0 * seen.sum(), 1.0))
     total, last_lag, last_value = 1.0, 0, 1.0
@@ -137,8 +117,6 @@ def _integrated_autocorrelation(series: Array, seen: Array, noise_free: bool) ->
         value = float((series[lag:] * series[:-lag]).sum()) / (3.0 * count * power)
         if value < 2.0 / np.sqrt(3.0 * count):
             break
-        if noise_free and lag == 1:
-            power, value = power * value, 1.0
         # Lags between are interpolated; lag zero itself counts once and is in the leading one.
         between = lag - last_lag
         total += 2.0 * (value + (between - 1) * 0.5 * (value + min(last_value, 2.0 * value)))

@@ -12,7 +12,6 @@ from cluster_slam.association.frames import Frames, sort_by_frame
 from cluster_slam.config import SmoothConfig
 from cluster_slam.graph.batch import PoseModel
 from cluster_slam.graph.noise import pose_model
-from cluster_slam.graph.variance import displacement_correlation
 from cluster_slam.records import Result, Session
 from cluster_slam.smoothing.finish import make_result
 from cluster_slam.smoothing.first import first_world
@@ -69,13 +68,10 @@ def smooth(
     if world.cov_step is None:
         world = regroup(frames, world, estimate, config, rng)
     frames, model = for_solving(stated, stated_poses, world)
-    smoother, estimate = solve(frames, model, world, config, 2)
+    smoother, estimate = solve(frames, model, world, config, 2, in_stretches=True)
     world = learn(world, smoother, estimate)
     if world.errs_slowly:  # all observations of a flower say the same: its place is as uncertain as one of them
         smoother.correlation = float(np.bincount(smoother.landmark, minlength=1).max())
-    smoother.pairs = replace(
-        smoother.pairs, sigma=smoother.pairs.sigma * np.sqrt(displacement_correlation(smoother, estimate))
-    )
     _, smoother.poses = with_variances(stated, stated_poses, world.noise)
     marginals = smoother.marginals(estimate)
     clock.lap("smoothing")

@@ -47,7 +47,7 @@ def make_result(
     clusters = cluster_table(rest, frames, confirmed)
     pairs = smoother.pairs
     _, cov = measured_displacements(frames, estimate.T, world.landmark, estimate.places, pairs.of, len(pairs.frame))
-    drift = drift_table(rest, frames, clusters, estimate.d, pairs.sigma**2, cov)
+    drift = drift_table(rest, frames, clusters, estimate.d, pairs.total_sigma**2, cov)
     flower_ids = np.full(len(frames), -1, dtype=np.int64)
     flower_ids[frames.order] = world.landmark
     cluster_ids = np.where(flower_ids >= 0, world.cluster[flower_ids], -1) if n_clusters else flower_ids
@@ -140,7 +140,7 @@ def estimated_noise(session: Session, frames: Frames, world: World, smoother: Ba
     found["flower_factor"] = float(np.sqrt(noise.flower))
     found["pose_factor"] = float(np.sqrt(noise.pose))
     if len(smoother.pairs.sigma):
-        found["sway"] = float(np.sqrt((smoother.pairs.sigma**2).mean()))
+        found["sway"] = float(np.sqrt((smoother.pairs.total_sigma**2).mean()))
     return found
 
 

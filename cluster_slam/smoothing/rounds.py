@@ -24,11 +24,11 @@ from cluster_slam.graph.batch import BatchSmoother, Estimate, Pairs, PoseModel
 from cluster_slam.graph.noise import camera_covs
 from cluster_slam.graph.variance import errs_slowly
 from cluster_slam.grouping import Motion, group_flowers
+from cluster_slam.smoothing.stretches import quarter_period, rest_sigma, stretches
 from cluster_slam.smoothing.world import NO_WEIGHT, World, fewest_observations, scalar_var
 from tracking.gating import chi2_threshold
 
 LEAST_WILD = 0.001  # share of wild errors that is always reckoned with
-_REST_SIGMA_M = 0.0004  # ambient sway of a cluster at rest
 
 
 def associate(frames: Frames, model: PoseModel, world: World, config: SmoothConfig) -> World:
@@ -54,14 +54,25 @@ def associate(frames: Frames, model: PoseModel, world: World, config: SmoothConf
 
 
 def solve(
-    frames: Frames, model: PoseModel, world: World, config: SmoothConfig, n_iterations: int
+    frames: Frames,
+    model: PoseModel,
+    world: World,
+    config: SmoothConfig,
+    n_iterations: int,
+    *,
+    in_stretches: bool = False,
 ) -> tuple[BatchSmoother, Estimate]:
-    """Solve for poses, hand-eye transform, flowers and displacements, the association given."""
-    smoother, start = problem(frames, model, world)
+    """Solve for poses, hand-eye transform, flowers and displacements, the association given.
+
+    ``in_stretches``: displacements are correlated in time, as covariances need it; places hardly change by it.
+    """
+    smoother, start = problem(frames, model, world, in_stretches=in_stretches)
     return smoother, smoother.solve(start, chi2_threshold(3, config.outlier_probability), n_iterations)
 
 
-def problem(frames: Frames, model: PoseModel, world: World) -> tuple[BatchSmoother, Estimate]:
+def problem(
+    frames: Frames, model: PoseModel, world: World, *, in_stretches: bool = False
+) -> tuple[BatchSmoother, Estimate]:
     """The graph of the session and where its solution starts."""
     of, frame, cluster = cluster_pairs(frames, world.landmark, world.cluster)
     d, cov = measured_displacements(frames, world.T, world.landmark, world.places, of, len(frame))
@@ -70,14 +81,12 @@ def problem(frames: Frames, model: PoseModel, world: World) -> tuple[BatchSmooth
     scale = motion_scale(d, cov + pose_var * np.eye(3), frame, cluster, frames.stamps)
     if np.bincount(world.cluster, minlength=1).max(initial=0) < 2:
         scale = np.zeros_like(scale)  # flowers that stand alone tell no sway from errors of their own
-    pairs = Pairs(
-        of=of,
-        frame=frame,
-        cluster=cluster,
-        sigma=np.hypot(scale, _REST_SIGMA_M),
-        stretch=np.full(len(frame), -1),
-        stretch_sigma=np.empty(0),
-    )
+    sigma = np.hypot(scale, rest_sigma(d, cov, scale, frame, cluster, frames.stamps))
+    stretch, stretch_sigma = np.full(len(frame), -1), np.empty(0)
+    if in_stretches:
+        length = quarter_period(d, scale, frame, cluster, frames.stamps)
+        stretch, stretch_sigma, sigma = stretches(d, cov, sigma, frame, cluster, frames.stamps, length)
+    pairs = Pairs(of=of, frame=frame, cluster=cluster, sigma=sigma, stretch=stretch, stretch_sigma=stretch_sigma)
     start = Estimate(
         T=world.T,
         X=world.X,
@@ -100,9 +109,7 @@ def observations_err_slowly(frames: Frames, model: PoseModel, world: World) -> b
     return errs_slowly(smoother, replace(start, d=np.zeros_like(start.d)))
 
 
-def regroup(
-    frames: Frames, world: World, estimate: Estimate, config: SmoothConfig, rng: np.random.Generator
-) -> World:
+def regroup(frames: Frames, world: World, estimate: Estimate, config: SmoothConfig, rng: np.random.Generator) -> World:
     """Group the flowers again, now that it is known how each moved; outliers have no say."""
     n = len(world.places)
     presence = presence_of(frames.frame, world.landmark, n, frames.n_frames)
