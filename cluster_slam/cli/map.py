@@ -16,6 +16,7 @@ from cluster_slam.errors import ConfigError
 
 if TYPE_CHECKING:
     from cluster_slam.io.map.incoming import Incoming
+    from cluster_slam.io.map.store import MapStore, StoredSession
     from cluster_slam.pipeline.remember import Added
     from cluster_slam.remember.decide import Decision
 
@@ -92,6 +93,10 @@ def add(
         incoming = _incoming(result, landmarks, date, session)
         if result is not None:
             check_result(result)
+        left = _left_incomplete(store, incoming, result)
+        if left is not None and result is not None:
+            complete_result(result, store, left)
+            return _tell_completed(left, quiet=quiet, as_json=as_json)
         added = add_session(
             store,
             incoming,
@@ -112,6 +117,25 @@ def add(
     if added.session is None:
         print_warnings([f"refused, the map is unchanged: {added.decision.reason}"])
     return 0 if added.session is not None else 1
+
+
+def _left_incomplete(store: MapStore, incoming: Incoming, result: Path | None) -> StoredSession | None:
+    """The session in the map, if just this result of it was added and the program then killed before it said so."""
+    from cluster_slam.io.map.complete import is_complete
+
+    if result is None or is_complete(result):
+        return None
+    same = [s for s in store.sessions() if s.session == incoming.constellation.session]
+    return same[0] if same and same[0].digest == incoming.digest else None
+
+
+def _tell_completed(session: StoredSession, *, quiet: bool, as_json: bool) -> int:
+    if as_json:
+        print_json({"aligned": True, "plant": session.plant, "session": session.session, "was_in_map": True})
+    elif not quiet:
+        rows = [("session", f"{session.session} is in the map already; its result is complete now")]
+        print_table("cluster-slam map add", rows)
+    return 0
 
 
 def _is_similarity(align: str) -> bool:
@@ -314,6 +338,32 @@ def undo(path: MapArgument, quiet: QuietOption = False, as_json: JsonOption = Fa
         print_json({"undone": session.session, "plant": session.plant})
     elif not quiet:
         print_table("cluster-slam map undo", [("session", session.session), ("plant", session.plant)])
+    return 0
+
+
+@app.command("merge", short_help="Take the plants of another map in.")
+def merge(
+    path: MapArgument,
+    other: Annotated[Path, typer.Argument(metavar="OTHER", help="The other map; it is only read.", show_default=False)],
+    prefix: Annotated[str, typer.Option("--prefix", help="Put before the names of its plants.")] = "",
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> int:
+    """Take the plants of another map in, with sessions and events, all or nothing; ids are given anew.
+
+    A plant that both maps have under one name is refused: give its sessions to `map add`, or use --prefix.
+
+    Example: cluster-slam map merge field.map greenhouse.map --prefix greenhouse-
+    """
+    from cluster_slam.io.map import open_map
+    from cluster_slam.io.map.merge import merge_map
+
+    with open_map(path) as store, open_map(other) as source:
+        plants, clusters = merge_map(store, source, prefix)
+    if as_json:
+        print_json({"plants": plants, "clusters": clusters})
+    elif not quiet:
+        print_table("cluster-slam map merge", [("plants", ", ".join(plants) or "none"), ("clusters", str(clusters))])
     return 0
 
 

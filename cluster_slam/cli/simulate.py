@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,6 +12,9 @@ from cluster_slam.cli.options import ConfigOption, JsonOption, QuietOption, Seed
 from cluster_slam.cli.progress import StageProgress
 from cluster_slam.cli.summary import print_json, print_table
 from cluster_slam.errors import ConfigError, OutputError
+
+if TYPE_CHECKING:
+    from cluster_slam.simulate.season import SeasonConfig
 
 SIMULATED = "simulated-"  # how the id of a simulated session begins
 
@@ -23,7 +26,7 @@ def command(
         typer.Option(
             "--preset",
             metavar="NAME",
-            help="moderate, hard, sample, or a strange one as moderate-tails; moderate-images renders.",
+            help="moderate, hard, sample, or a strange one as moderate-tails; moderate-images renders; season: days.",
         ),
     ] = "moderate",
     seed: SeedOption = 0,
@@ -41,11 +44,14 @@ def command(
     from dataclasses import asdict
 
     from cluster_slam.simulate import PRESETS, simulate
+    from cluster_slam.simulate.season import SEASONS
 
+    if preset in SEASONS:
+        return _season(out, preset, configured(SEASONS[preset], config, settings or []), seed, quiet, as_json)
     if preset not in PRESETS:
         near = difflib.get_close_matches(preset, PRESETS, 1)
         hint = f"; did you mean {near[0]}?" if near else ""
-        raise ConfigError(f"unknown preset {preset!r}{hint} (known: {', '.join(PRESETS)})")
+        raise ConfigError(f"unknown preset {preset!r}{hint} (known: {', '.join([*PRESETS, *SEASONS])})")
     _check_replaceable(out)
     options = configured(PRESETS[preset], config, settings or [])
     with StageProgress(is_shown=not (quiet or as_json)) as progress:
@@ -55,6 +61,24 @@ def command(
         print_json({"out": str(out), "preset": preset, "seed": seed, "config": asdict(options)})
     elif not quiet:
         print_table("cluster-slam simulate", [("preset", preset), ("seed", str(seed)), ("session", str(out))])
+    return 0
+
+
+def _season(out: Path, preset: str, options: SeasonConfig, seed: int, quiet: bool, as_json: bool) -> int:
+    """Write a folder a day of a season."""
+    from dataclasses import asdict
+
+    from cluster_slam.simulate.season import simulate_season
+
+    with StageProgress(is_shown=not (quiet or as_json)) as progress:
+        progress("simulating", 0.0)
+        folders = simulate_season(options, out, seed=seed)
+    if as_json:
+        sessions = [str(folder) for folder in folders]
+        print_json({"out": str(out), "preset": preset, "seed": seed, "sessions": sessions, "config": asdict(options)})
+    elif not quiet:
+        rows = [("preset", preset), ("seed", str(seed)), *(("session", str(folder)) for folder in folders)]
+        print_table("cluster-slam simulate", rows)
     return 0
 
 

@@ -14,6 +14,7 @@ from cluster_slam.errors import InputError
 from cluster_slam.geometry import Array, inverse, transform
 from cluster_slam.io.map.incoming import Incoming
 from cluster_slam.io.map.store import MapStore, StoredSession
+from cluster_slam.io.map.times import iso
 from cluster_slam.io.map.write import Entry, next_ids, put
 from cluster_slam.records import Constellation, PlantMap
 from cluster_slam.remember.decide import Decision, Refusal, decide
@@ -21,6 +22,7 @@ from cluster_slam.remember.looked import looked_at
 from cluster_slam.remember.update import aligned, empty_plant, update
 
 Progress = Callable[[str, float], None]
+FAR_M = 100.0  # no plant is so large
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +73,7 @@ def add(
     session = incoming.constellation
     with store.write() as connection:
         _check_new(store, incoming)
+        _check_unit(session)
         name = plant or (None if any_plant else session.plant)
         known = store.plant_names()
         tried = [name] if name in known else ([] if name is not None else known)
@@ -78,6 +81,7 @@ def add(
         decision = decide(session, plants, config, similarity=similarity, progress=progress)
         match = decision.accepted
         if match is not None and match.found is not None:
+            _check_order(store, session, match.name)
             entry = _known(store, incoming, match.found, decision, config)
         elif not plants or (new_plant and name is None and decision.refusal is not Refusal.AMBIGUOUS):
             entry = _first(store, incoming, name or _free_name(session, known), config)
@@ -99,6 +103,20 @@ def _check_new(store: MapStore, incoming: Incoming) -> None:
             same = "the same" if other.digest == incoming.digest else "another"
             text = f"{store.path}: session {session.session!r} is in the map already ({same} result of it)"
             raise InputError(f"{text}, expected each once; `map undo` takes out the latest")
+
+
+def _check_unit(session: Constellation) -> None:
+    spread = float(np.sqrt(((session.flowers - session.flowers.mean(axis=0)) ** 2).sum(1).mean()))
+    if spread > FAR_M:
+        text = f"{session.session}: its flowers spread over {spread:.4g} m (RMS)"
+        raise InputError(f"{text}, expected one plant in metres: are these millimetres?")
+
+
+def _check_order(store: MapStore, session: Constellation, plant: str) -> None:
+    latest = store.plant(plant).last_session
+    if session.end < latest:
+        text = f"{session.session}: its last frame is of {iso(session.end)}, but {plant} has a session of {iso(latest)}"
+        raise InputError(f"{text}, expected sessions in the order of time; `map undo` takes out the latest")
 
 
 def _free_name(session: Constellation, known: list[str]) -> str:

@@ -134,8 +134,10 @@ class SeasonPlant:
         self.offsets = np.concatenate([self.offsets, new])
 
     def visited(self, *, cut: bool) -> IntArray:
-        """Clusters that a session of today visits: any, or those on one side of a cut across the row."""
+        """Clusters that a session of today visits: any; with a cut, all on the first day, then one side of it."""
         n = len(self.centroids)
+        if cut and self.day == self.config.day_list[0]:
+            return np.arange(n)
         side = self.rng.choice([-1.0, 1.0]) * self.centroids[:, 0] if cut else self.rng.random(n)
         return np.sort(np.argsort(side)[: max(3, round(self.config.visited_share * n))])
 

@@ -26,6 +26,11 @@ def check_result(folder: Path) -> None:
     recover(folder)
 
 
+def is_complete(folder: Path) -> bool:
+    """Whether a result says already who is who in a map."""
+    return (folder / "identities.csv").exists() and (folder / "flower_identities.csv").exists()
+
+
 def complete_result(folder: Path, store: MapStore, session: StoredSession) -> None:
     """Write ``identities.csv``, ``flower_identities.csv`` and the alignment in ``run.json``, all or nothing.
 

@@ -176,7 +176,9 @@ def undo(store: MapStore) -> StoredSession:
         last = sessions[-1]
         found = connection.execute("SELECT before FROM journal WHERE session_id = ?", (last.id,)).fetchone()
         if found is None:
-            raise InputError(f"{store.path}: session {last.session!r} is too long ago to undo")
+            raise InputError(
+                f"{store.path}: session {last.session!r} cannot be undone: it is too long ago, or came by a merge"
+            )
         journal = json.loads(zlib.decompress(found[0]))
         _check_events(connection, store, last, [row[0] for row in journal["clusters"] if len(row) == 1])
         for table in ("journal", "observations", "flower_observations"):
