@@ -18,6 +18,7 @@ from cluster_slam.cli import (
     compare,
     detect,
     evaluate,
+    experiment,
     exporting,
     figures,
     importing,
@@ -74,6 +75,7 @@ app.command("detect", short_help="Find flowers in pictures.")(detect.command)
 app.command("figures")(figures.command)
 app.command("compare-descriptors")(compare.command)
 app.command("calibrate")(calibrate.command)
+app.command("experiment")(experiment.command)
 app.command("localise")(localise.command)
 app.command("record")(record.command)
 app.command("import")(importing.command)
