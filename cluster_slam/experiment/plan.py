@@ -28,11 +28,11 @@ METHODS: dict[str, Any] = {
 }
 TASK_OPTIONS: dict[str, dict[str, Value]] = {
     "localise": {
-        "independent": False,
-        "window": 0,
-        "map_age_days": 0.0,
-        "map_drift_m_per_day": 0.003,
-        "wrong_map": False,
+        "independent": False,  # every frame kidnapped
+        "window": 0,  # frames; 0: all before
+        "map_age_days": 0.0,  # since the map was made
+        "map_drift_m_per_day": 0.003,  # RMS norm, of each cluster since then
+        "wrong_map": False,  # of another plant
     },
     "smooth": {},
     "track": {"with_calibration": True},
@@ -191,9 +191,7 @@ def resolve(cell: Cell) -> Resolved:
         else:
             near = difflib.get_close_matches(name, [*worlds, *task], 1)
             hint = f"; did you mean {near[0]}?" if near else ""
-            raise ConfigError(
-                f"unknown option {name!r} of the task {cell.task}{hint}; options of the method begin with config."
-            )
+            raise ConfigError(f"unknown option {name!r} of {cell.task}{hint}; those of the method begin with config.")
     simulated = override(PRESETS[cell.preset], world)
     return Resolved(
         simulated, override(SeasonConfig(session=simulated), season), override(METHODS[cell.task](), method), task

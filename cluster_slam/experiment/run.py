@@ -86,9 +86,8 @@ def _read(experiment: Experiment, path: Path) -> dict[str, Figures]:
     except (json.JSONDecodeError, KeyError, TypeError):
         raise OutputError(f"{path}: row 1 names no experiment, expected the journal of an earlier run") from None
     if digest != experiment.digest:
-        raise OutputError(
-            f"{path}: holds another experiment ({head.get('experiment')!r}), expected a folder of its own"
-        )
+        name = head.get("experiment")
+        raise OutputError(f"{path}: holds another experiment ({name!r}), expected a folder of its own")
     done: dict[str, Figures] = {}
     whole = [lines[0]]
     for line in lines[1:]:

@@ -147,7 +147,7 @@ def _pictures(path: Path) -> tuple[Session, Camera, list[tuple[int, Path]]]:
 
 
 def _finder(spec: BoardSpec) -> Callable[[Any], list[tuple[IntArray, Array, Array]]]:
-    """What finds rigid sets of corners in a picture: their labels (k,), places on the board (k, 3) and pixels (k, 2)."""
+    """What finds rigid sets of corners in a picture: labels (k,), places on the board (k, 3), pixels (k, 2)."""
     from cv2 import aruco
 
     if spec.kind == "charuco":
