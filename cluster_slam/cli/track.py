@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, replace
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
+from shutil import rmtree
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,10 +24,14 @@ from cluster_slam.cli.options import (
     configured,
 )
 from cluster_slam.cli.progress import StageProgress
+from cluster_slam.cli.stopping import Stopping
 from cluster_slam.cli.summary import print_json, print_table, print_warnings, result_rows, truth_rows
+from cluster_slam.cli.track_view import TrackView
 
 if TYPE_CHECKING:
-    from cluster_slam.records import Result
+    from cluster_slam.config import OnlineConfig
+    from cluster_slam.online.records import Update
+    from cluster_slam.records import Calibration, Result, Session, Truth
 
 
 def command(
@@ -37,7 +44,12 @@ def command(
         typer.Option("--calibration", metavar="FILE", help="calibration.toml as smooth writes it.", show_default=False),
     ] = None,
     realtime: Annotated[bool, typer.Option("--realtime", help="At the pace of the recording.")] = False,
+    stream: Annotated[
+        str | None,
+        typer.Option("--stream", metavar="WHERE", help="JSON lines to - or tcp://127.0.0.1:PORT.", show_default=False),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where a run into OUT was cut off.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="A live picture in the terminal.")] = False,
     config: ConfigOption = None,
     settings: SetOption = None,
     level: Annotated[
@@ -50,58 +62,105 @@ def command(
     """Follow the clusters of a session frame by frame, as if it were live.
 
     Each row of the result is what was known when its frame had just been processed; no later frame improves it.
+    Ctrl-C and SIGTERM stop after a frame: --resume goes on from there, with the same identities.
 
     Example: cluster-slam track data/sample -o out/track
     """
     from cluster_slam.config import OnlineConfig
-    from cluster_slam.evaluation import evaluate
+    from cluster_slam.errors import ConfigError
     from cluster_slam.io.read_result import read_calibration
-    from cluster_slam.io.result import check_output, write_result
+    from cluster_slam.io.result import check_output
     from cluster_slam.io.session import open_session, open_truth
-    from cluster_slam.online.journal import journal_of
-    from cluster_slam.pipeline.track import track
-    from cluster_slam.report.page import render_report
 
+    if stream == "-" and as_json:
+        raise ConfigError("--stream - and --json both want standard output, expected one of them")
     check_output(out)
     options = configured(OnlineConfig(), config, settings or [])
     known = None if calibration is None else read_calibration(calibration)
     started = perf_counter()
     opened = open_session(session, level=level)
     truth = open_truth(session, opened)
-    with StageProgress(is_shown=not (quiet or as_json)) as progress:
-        result = track(
-            opened,
-            calibration=known,
-            config=options,
-            seed=seed,
-            realtime=realtime,
-            out=out,
-            resume=resume,
-            progress=progress,
-        )
-        progress("evaluating", 0.95)
-        metrics = None if truth is None else evaluate(result, opened, truth)
-        result = replace(result, config=result.config or asdict(options))
-        files: dict[str, str | bytes] = {"report.html": render_report(result, metrics)}
-        if metrics is not None:
-            files["metrics.json"] = json.dumps(metrics.as_json(), indent=2, allow_nan=False) + "\n"
-        write_result(result, out, extra_files=files)
-    _clear(journal_of(out))
-    numbers = {} if metrics is None else metrics.as_json()
+    is_shown = not (quiet or as_json or view)
+    work = _Work(out, options, known, seed, realtime, resume, stream, view)
+    with StageProgress(is_shown=is_shown) as progress, Stopping() as stopping:
+        result, numbers = work.run(opened, truth, progress, stopping)
     if as_json:
         print_json({**json.loads((out / "run.json").read_text("utf-8")), "metrics": numbers, "out": str(out)})
-    elif not quiet:
+    elif not quiet and stream != "-":
         _tell(result, numbers, out, perf_counter() - started)
     if result.status == "poor":
         print_warnings([f"the result is poor: {'; '.join(result.warnings) or 'see the report'}"])
     return 0 if result.status == "ok" else 1
 
 
-def _clear(journal: Path) -> None:
-    """The result stands: its journal is not needed any more."""
-    import shutil
+@dataclass(frozen=True, slots=True)
+class _Work:
+    """What the options ask for."""
 
-    shutil.rmtree(journal, ignore_errors=True)
+    out: Path
+    options: OnlineConfig
+    calibration: Calibration | None
+    seed: int
+    realtime: bool
+    resume: bool
+    stream: str | None
+    view: bool
+
+    def run(
+        self, session: Session, truth: Truth | None, progress: StageProgress, stopping: Stopping
+    ) -> tuple[Result, dict[str, float]]:
+        """Track, evaluate where there is truth, render the report, write all of it."""
+        from cluster_slam.evaluation import evaluate
+        from cluster_slam.io.result import write_result
+        from cluster_slam.online.journal import journal_of
+        from cluster_slam.report.page import render_report
+
+        result = self._track(session, progress, stopping)
+        progress("evaluating", 0.95)
+        metrics = None if truth is None else evaluate(result, session, truth)
+        files: dict[str, str | bytes] = {"report.html": render_report(result, metrics)}
+        numbers = {} if metrics is None else metrics.as_json()
+        if metrics is not None:
+            files["metrics.json"] = json.dumps(numbers, indent=2, allow_nan=False) + "\n"
+        write_result(result, self.out, extra_files=files)
+        rmtree(journal_of(self.out), ignore_errors=True)
+        return result, numbers
+
+    def _track(self, session: Session, progress: StageProgress, stopping: Stopping) -> Result:
+        from cluster_slam.online.stream import open_stream
+        from cluster_slam.pipeline.track import StoppedError, track
+
+        with ExitStack() as stack:
+            listeners: list[Callable[[Update], None]] = []
+            lines = None if self.stream is None else open_stream(self.stream, patient=not self.realtime)
+            if lines is not None:
+                listeners.append(lines.put)
+            if self.view:
+                listeners.append(stack.enter_context(TrackView()).show)
+
+            def tell(update: Update) -> None:
+                for listen in listeners:
+                    listen(update)
+
+            try:
+                result = track(
+                    session,
+                    calibration=self.calibration,
+                    config=self.options,
+                    seed=self.seed,
+                    realtime=self.realtime,
+                    out=self.out,
+                    resume=self.resume,
+                    progress=progress,
+                    on_update=tell,
+                    should_stop=stopping,
+                )
+            except StoppedError as stopped:
+                sys.stderr.write(f"cluster-slam: {stopped}\n")
+                raise SystemExit(128 + (stopping.signal or 0)) from None
+            finally:
+                lost = () if lines is None else lines.close()
+        return replace(result, warnings=(*result.warnings, *lost))
 
 
 def _tell(result: Result, metrics: Mapping[str, float], out: Path, seconds: float) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -116,6 +117,15 @@ class IncrementalMap:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Written down without what follows from the rest: factors of frames, and room to grow."""
+        H, g = self.information
+        state = dict(self.__dict__, _H=H.copy(), _g=g.copy(), recent=[m for m, _ in self.recent])
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, recent=deque((m, eliminate(m)) for m in state["recent"]))
 
     @property
     def information(self) -> tuple[Array, Array]:

@@ -11,6 +11,7 @@ from cluster_slam.records import BoolArray, Frame
 
 _BACK = 5  # frames in order among themselves, but older than the last: then the clock was set back
 _ROTATION_TOLERANCE = 1e-3
+_FAR_M = 1e3  # no camera sees a flower so far away
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +78,8 @@ def usable_points(points: Array, covs: Array) -> BoolArray:
     """Which points (q,) are finite, before the camera, and have a covariance that is one."""
     if len(points) == 0:
         return np.zeros(0, dtype=bool)
-    good = np.isfinite(points).all(1) & np.isfinite(covs).all((1, 2)) & (points[:, 2] > 0)
+    with np.errstate(invalid="ignore"):
+        good = (np.abs(points) < _FAR_M).all(1) & (np.abs(covs) < _FAR_M**2).all((1, 2)) & (points[:, 2] > 0)
     safe = np.where(good[:, None, None], covs, np.eye(3))
     symmetric = np.abs(safe - np.swapaxes(safe, 1, 2)).max((1, 2)) <= 1e-6 * np.abs(safe).max((1, 2))
     out: BoolArray = good & symmetric & (np.linalg.eigvalsh(safe)[:, 0] > 0)

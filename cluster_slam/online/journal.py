@@ -30,8 +30,9 @@ _FRAMES = np.dtype([("stamp", "<f8"), ("pose", "<f8", 7)])
 _DRIFT = np.dtype([("frame", "<i4"), ("cluster", "<i4"), ("position", "<f8", 3), ("cov", "<f4", (3, 3))])
 _TABLES = {"rows.bin": _ROWS, "frames.bin": _FRAMES, "drift.bin": _DRIFT}
 _TEXTS = ("revisions.txt", "warnings.txt")
-_TRUSTED = ("numpy", "collections", "tracking.", "cluster_slam.", "builtins", "copyreg")
-_REFUSED = {"eval", "exec", "compile", "open", "getattr", "setattr", "__import__", "input", "breakpoint", "globals"}
+_OURS = ("cluster_slam.online.", "cluster_slam.graph.incremental", "cluster_slam.config", "cluster_slam.records")
+_PLAIN = {"list", "dict", "set", "frozenset", "tuple", "int", "float", "bool", "slice", "range", "deque", "bytearray"}
+_ARRAYS = {"_reconstruct", "ndarray", "dtype", "scalar", "_frombuffer", "_convert_to_numpy_array"}
 
 
 def journal_of(out: Path) -> Path:
@@ -59,12 +60,12 @@ class Journal:
         The disk is full, or the place cannot be written.
     """
 
-    def __init__(self, out: Path, *, resume: bool = False) -> None:
-        self.folder = journal_of(out)
-        self.n_frames = 0
+    def __init__(self, out: Path, session_id: str, *, n_frames: int = 0) -> None:
+        """``n_frames`` are there already, if a run that was cut off goes on."""
+        self.folder, self.session_id, self.n_frames = journal_of(out), session_id, n_frames
         self._last_mark = -np.inf
         try:
-            if not resume and self.folder.exists():
+            if not n_frames and self.folder.exists():
                 shutil.rmtree(self.folder)
             self.folder.mkdir(parents=True, exist_ok=True)
             self._files = {name: (self.folder / name).open("ab") for name in (*_TABLES, *_TEXTS)}
@@ -82,7 +83,7 @@ class Journal:
                 continue  # a full disk has been told of by the write that met it
 
     def write(self, update: Update, tracker: OnlineTracker) -> None:
-        """Append an accepted update."""
+        """Append what an update says."""
         i, q = self.n_frames, len(update.flower_ids)
         rows = np.zeros(q, _ROWS)
         rows["frame"], rows["flower"], rows["cluster"] = i, update.flower_ids, update.cluster_ids
@@ -104,10 +105,6 @@ class Journal:
             self.mark(tracker)
             self._last_mark = update.stamp
 
-    def note(self, stamp: float, warning: str) -> None:
-        """Append a warning that belongs to no accepted frame."""
-        self._append("warnings.txt", f"{stamp:.6f} {warning}\n".encode())
-
     def mark(self, tracker: OnlineTracker) -> None:
         """From here a killed run can go on."""
         try:
@@ -115,7 +112,7 @@ class Journal:
                 file.flush()
             sizes = {name: file.tell() for name, file in self._files.items()}
             new = self.folder / "mark.new"
-            new.write_bytes(pickle.dumps((self.n_frames, sizes, tracker), protocol=5))
+            new.write_bytes(pickle.dumps((self.n_frames, sizes, self.session_id, tracker), protocol=5))
             os.replace(new, self.folder / "mark.bin")
         except OSError as error:
             raise OutputError(f"{self.folder}: cannot be written ({error.strerror})") from None
@@ -125,11 +122,6 @@ class Journal:
         for file in self._files.values():
             file.flush()
         return read_journal(self.folder)
-
-    def remove(self) -> None:
-        """The result stands: the journal is not needed any more."""
-        self.__exit__()
-        shutil.rmtree(self.folder, ignore_errors=True)
 
     def _append(self, name: str, content: bytes) -> None:
         try:
@@ -148,7 +140,7 @@ def read_journal(folder: Path) -> Told:
     return Told(tables[0], tables[1], tables[2], texts[0], texts[1])
 
 
-def resume(out: Path) -> tuple[OnlineTracker, int]:
+def resume(out: Path, session_id: str) -> tuple[OnlineTracker, int]:
     """The tracker as it was at the last mark, and how many frames it had taken; the tables are cut there.
 
     Raises
@@ -161,7 +153,9 @@ def resume(out: Path) -> tuple[OnlineTracker, int]:
     if not path.exists():
         raise InputError(f"{path}: missing, expected the journal of a run that was cut off")
     try:
-        n_frames, sizes, tracker = _Reader(io.BytesIO(path.read_bytes())).load()
+        n_frames, sizes, of, tracker = _Reader(io.BytesIO(path.read_bytes())).load()
+        if of != session_id:
+            raise InputError(f"{path}: of the session {of!r}, expected {session_id!r}")
         for name in (*_TABLES, *_TEXTS):
             with (folder / name).open("ab") as file:
                 file.truncate(int(sizes[name]))
@@ -174,8 +168,14 @@ class _Reader(pickle.Unpickler):
     """Reads marks, and nothing that could do anything else than hold numbers."""
 
     def find_class(self, module: str, name: str) -> Any:
-        known = any(module == t.rstrip(".") or module.startswith(t) for t in _TRUSTED)
-        if not known or name.split(".")[0] in _REFUSED:
+        known = (
+            (module.startswith((*_OURS, "tracking.")) and "." not in name and not name.startswith("__"))
+            or (module in ("builtins", "collections") and name in _PLAIN)
+            or (module.startswith("numpy") and name in _ARRAYS)
+            or (module == "copyreg" and name == "_reconstructor")
+            or (module == "builtins" and name == "object")
+        )
+        if not known:
             raise pickle.UnpicklingError(f"{module}.{name} has no place in a mark")
         return super().find_class(module, name)
 

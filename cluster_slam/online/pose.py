@@ -69,13 +69,14 @@ def solve_pose(
             d = (information(A + inverse_P) @ (B @ z - b)[..., None])[..., 0]
             r = residual - J @ z + d[s]
             weight = 1.0 / (1.0 + np.einsum("qi,qij,qj->q", r, W, r) / 6.0)
-    others = np.linalg.inv(0.5 * (H - H_of + np.swapaxes(H - H_of, 1, 2)))
-    z_others = (others @ (g - g_of)[..., None])[..., 0]
-    cov = information(A)
-    mean_J = cov @ B
-    shift = (cov @ ((B @ z_others[..., None])[..., 0] - b)[..., None])[..., 0]
-    shift_cov = cov + mean_J @ others @ np.swapaxes(mean_J, 1, 2)
-    return PoseSolution(z, np.linalg.inv(H), seen, shift, 0.5 * (shift_cov + np.swapaxes(shift_cov, 1, 2)), weight)
+    # What a cluster's displacement is measured to be, its own flowers' and all others' word on the pose taken together.
+    own = H - H_of + np.tensordot(sums, JWJ, 1)
+    gain = np.swapaxes(np.linalg.solve(own, np.swapaxes(B, 1, 2)), 1, 2)
+    known = A - gain @ B.swapaxes(1, 2)
+    vector = (gain @ (g - g_of + sums @ JWr)[..., None])[..., 0] - b
+    shift_cov = information(0.5 * (known + np.swapaxes(known, 1, 2)))
+    shift = (shift_cov @ vector[..., None])[..., 0]
+    return PoseSolution(z, np.asarray(np.linalg.inv(H), np.float64), seen, shift, shift_cov, weight)
 
 
 def no_pose(cov: Array) -> PoseSolution:

@@ -20,6 +20,7 @@ from cluster_slam.online.world import World
 from cluster_slam.records import Calibration, Frame, IntArray, PoseError, RejectReason, StatedNoise
 from tracking.ukf import prepare
 
+_LEAST_M = 1e-5  # no point is known better: numbers must stay numbers
 _ALL_S = 5.0  # the whole map is solved this often, once the hand-eye transform is frozen
 
 
@@ -103,7 +104,8 @@ class OnlineTracker:
     def _view(self, frame: Frame, use: IntArray, stamp: float, dt: float) -> View:
         """The frame's usable points, with the camera's pose as it is known before they speak."""
         T, cov = self._predicted_pose(frame, dt)
-        S = rotate_cov(T[:3, :3], 0.5 * (frame.covs[use] + np.swapaxes(frame.covs[use], 1, 2)))
+        stated = 0.5 * (frame.covs[use] + np.swapaxes(frame.covs[use], 1, 2))
+        S = rotate_cov(T[:3, :3], stated) + _LEAST_M**2 * np.eye(3)
         return View(T, cov, frame.points[use], S, stamp, self.n_frames)
 
     def _predicted_pose(self, frame: Frame, dt: float) -> tuple[Array, Array]:

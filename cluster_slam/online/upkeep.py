@@ -72,7 +72,9 @@ def regroup(world: World, stamp: float) -> None:
     if len(rows) < 2:
         return
     old = table.slot[rows]
-    label = world.grouping.group(table.seat[rows], table.place[rows], old, world.view_volume(), world.rng)
+    label = world.grouping.group(
+        table.seat[rows], table.place[rows], old, world.view_volume(), np.random.default_rng(world.seed)
+    )
     weight = np.zeros((int(label.max()) + 1, len(world.clusters)))
     np.add.at(weight, (label, old), 1.0)
     if ((weight > 0).sum(0) <= 1).all() and ((weight > 0).sum(1) <= 1).all():

@@ -38,7 +38,7 @@ class World:
         self.clusters: list[ClusterTrack] = []
         self.map = IncrementalMap(hand_eye_information, config.undo_s)
         self.grouping = OnlineGrouping(config.grouping)
-        self.rng = np.random.default_rng(seed)
+        self.seed = seed
         self.merged: list[tuple[int, int]] = []  # flowers: from, to
         self.merged_clusters: list[tuple[int, int]] = []
         self.revisions: list[Revision] = []  # of the present frame

@@ -11,16 +11,26 @@ from time import perf_counter, process_time
 import numpy as np
 
 from cluster_slam.config import OnlineConfig
+from cluster_slam.errors import ClusterSlamError
 from cluster_slam.geometry import Array
 from cluster_slam.live.replay import Replay
+from cluster_slam.live.view import FrameSource
 from cluster_slam.online.journal import Journal
 from cluster_slam.online.journal import resume as resume_journal
 from cluster_slam.online.records import Update
 from cluster_slam.online.result import make_result
 from cluster_slam.online.tracker import OnlineTracker
-from cluster_slam.records import Calibration, Frame, Result, Session
+from cluster_slam.records import Calibration, Frame, Observations, Result, Session
 
 Progress = Callable[[str, float], None]
+
+
+class StoppedError(ClusterSlamError):
+    """Tracking was stopped before the end, on request; ``journal`` is where it can go on."""
+
+    def __init__(self, message: str, journal: Path) -> None:
+        super().__init__(f"{message}; what was tracked is in {journal}, --resume goes on from there")
+        self.journal = journal
 
 
 def track(
@@ -34,6 +44,7 @@ def track(
     resume: bool = False,
     progress: Progress | None = None,
     on_update: Callable[[Update], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
 ) -> Result:
     """Follow a session frame by frame, as if it were live: each row is what was known when its frame was processed.
 
@@ -49,14 +60,23 @@ def track(
     resume : go on from such a journal.
     progress : called with the stage in words and a fraction 0..1.
     on_update : called with each update.
+    should_stop : asked after each frame; a yes ends the run, which can then be resumed.
+
+    Raises
+    ------
+    StoppedError
+        Somebody wanted it to stop; the journal holds what was tracked.
+    InputError
+        There is nothing to resume, or of another session.
+    OutputError
+        The journal cannot be written.
     """
     say = progress or (lambda _stage, _fraction: None)
     with tempfile.TemporaryDirectory() as temporary:
         place = Path(temporary) / "result" if out is None else out
         tracker, n_done = _begin(session, place, calibration, config, seed, resume)
         begun = perf_counter()
-        with Journal(place, resume=resume) as journal:
-            journal.n_frames = n_done
+        with Journal(place, session.id, n_frames=n_done) as journal:
             times = np.zeros(max(session.n_frames - n_done, 0))
             for i, frame in enumerate(_frames(session, n_done, realtime)):
                 before = process_time()
@@ -65,10 +85,70 @@ def track(
                 times[i] = process_time() - before
                 if on_update is not None:
                     on_update(update)
+                if should_stop is not None and should_stop():
+                    journal.mark(tracker)
+                    raise StoppedError(f"stopped after {journal.n_frames} of {session.n_frames} frames", journal.folder)
                 if i % 30 == 0:
                     say("tracking", (n_done + i) / session.n_frames)
             result = make_result(session, tracker, journal.read(), _timings(times, perf_counter() - begun))
         return replace(result, seed=seed)
+
+
+def track_source(
+    source: FrameSource,
+    out: Path,
+    *,
+    calibration: Calibration | None = None,
+    config: OnlineConfig | None = None,
+    seed: int = 0,
+    on_update: Callable[[Update], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Result:
+    """Follow a live source until it ends or somebody wants to stop; frames that were refused are in no table.
+
+    Parameters as of ``track``; the journal lies beside ``out`` until the caller has written the result.
+    """
+    header = source.header
+    tracker, _ = _begin(header, out, calibration, config, seed, resume=False)
+    taken: list[Frame] = []
+    times: list[float] = []
+    warnings: list[str] = []
+    begun = perf_counter()
+    with Journal(out, header.id) as journal:
+        for frame in source.frames():
+            before = process_time()
+            update = tracker.step(frame)
+            if update.is_accepted and (not taken or frame.stamp > taken[-1].stamp):
+                journal.write(update, tracker)
+                taken.append(frame)
+            else:
+                warnings.extend(update.warnings)
+            times.append(process_time() - before)
+            warnings.extend(notice.text for notice in source.notices())
+            if on_update is not None:
+                on_update(update)
+            if should_stop is not None and should_stop():
+                break
+        journal.mark(tracker)
+        session = _session_of(header, taken)
+        result = make_result(session, tracker, journal.read(), _timings(np.array(times), perf_counter() - begun))
+    return replace(result, seed=seed, warnings=tuple(dict.fromkeys([*result.warnings, *warnings])))
+
+
+def _session_of(header: Session, frames: list[Frame]) -> Session:
+    """The session that a live source has been."""
+    counts = [len(f) for f in frames]
+    none = np.zeros(0)
+    scores = [np.full(len(f), np.nan) if f.scores is None else f.scores for f in frames]
+    observations = Observations(
+        frame=np.repeat(np.arange(len(frames)), counts),
+        points=np.concatenate([none.reshape(0, 3), *(f.points for f in frames)]),
+        covs=np.concatenate([none.reshape(0, 3, 3), *(f.covs for f in frames)]),
+        scores=np.concatenate([none, *scores]),
+    )
+    stamps = np.array([f.stamp for f in frames])
+    poses = np.array([f.pose for f in frames]).reshape(-1, 4, 4)
+    return replace(header, stamps=stamps, poses=poses, observations=observations)
 
 
 def _begin(
@@ -81,7 +161,7 @@ def _begin(
 ) -> tuple[OnlineTracker, int]:
     """A new tracker, or the one of the last mark, and how many frames it has taken."""
     if resume:
-        return resume_journal(out)
+        return resume_journal(out, session.id)
     given = calibration if session.T_flange_camera is not None else None
     tracker = OnlineTracker(
         session.noise,
