@@ -100,8 +100,8 @@ def test_images_come_through_unchanged() -> None:
         assert np.array_equal(view.colour, colours[k])
         assert view.depth.dtype == np.uint16
         assert np.array_equal(view.depth, depth)
-    assert camera.camera is not None
-    assert (camera.camera.fx, camera.camera.cy, camera.camera.width) == (60.0, 23.5, WIDTH)
+    assert camera.intrinsics is not None
+    assert (camera.intrinsics.fx, camera.intrinsics.cy, camera.intrinsics.width) == (60.0, 23.5, WIDTH)
 
 
 def test_depth_is_aligned_to_colour() -> None:

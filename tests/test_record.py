@@ -10,13 +10,17 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from rtde_help import SPEED, EmulatedRobot, line_motion
 
 from cluster_slam.cli.app import run
 from cluster_slam.geometry import so3_log
+from cluster_slam.io.camera_info import read_camera
+from cluster_slam.io.exporters.pictures import open_pictures
 from cluster_slam.io.importers.rtde_csv import read_rtde_csv
+from cluster_slam.io.metadata import read_metadata
 from cluster_slam.io.session import open_session
 
 Process = subprocess.Popen[str]
@@ -103,6 +107,43 @@ def test_a_loss_does_not_end_it(tmp_path: Path) -> None:
     assert rows == aside + len(session.observations)
     assert np.abs(session.poses[:, 0, 3] - SPEED * (session.stamps - robot.summary["began"])).max() < 0.01 * SPEED
     assert "lost" in (out / "notices.csv").read_text()
+
+
+def test_pictures_on_an_arm(tmp_path: Path) -> None:
+    """Images that a program drops into a folder, bit by bit, with the folder's intrinsics and unit of depth."""
+    camera, out = tmp_path / "camera", tmp_path / "session"
+    for name in ("rgb", "depth"):
+        (camera / name).mkdir(parents=True)
+    matrix = "  rows: 3\n  cols: 3\n  data: [30.0, 0, 15.5, 0, 30, 11.5, 0, 0, 1]\n"
+    (camera / "camera.yaml").write_text(f"image_width: 32\nimage_height: 24\ncamera_matrix:\n{matrix}")
+    toml = 'format = 1\nid = "c"\n[frames]\npose = "T_world_camera"\n[depth]\nscale = 0.0001\ncamera = "d405"\n'
+    (camera / "session.toml").write_text(toml)
+    rng = np.random.default_rng(6)
+    colours = rng.integers(0, 256, (10, 24, 32, 3), dtype=np.uint8)
+    depths = rng.integers(3000, 8000, (10, 24, 32)).astype(np.uint16)
+    with EmulatedRobot(line_motion(tmp_path)) as robot:
+        process = recorder(robot, out, "--camera", str(camera))
+        wait_for(tmp_path / "session.recording" / "robot.csv")
+        time.sleep(0.3)
+        for colour, depth in zip(colours, depths, strict=True):
+            now = repr(time.time())
+            cv2.imwrite(str(camera / "depth" / f"{now}.png"), depth)
+            cv2.imwrite(str(camera / "rgb" / f"{now}.png"), colour)
+            time.sleep(0.1)
+        (camera / "done").touch()
+        told = json.loads(process.communicate(timeout=20)[0])
+    assert process.returncode == 0, told
+    assert told["frames"] == 10
+    session = open_pictures(out)
+    assert np.abs(session.poses[:, 0, 3] - SPEED * (session.stamps - robot.summary["began"])).max() < 0.01 * SPEED
+    metadata, _ = read_metadata(out / "session.toml")
+    assert (metadata.depth.scale, metadata.depth.camera) == (0.0001, "d405")
+    assert read_camera(out / "camera.yaml").cx == 15.5
+    for name, images in (("rgb", colours), ("depth", depths)):
+        rows = [line.split() for line in (out / f"{name}.txt").read_text().splitlines()[1:]]
+        assert [float(stamp) for stamp, _ in rows] == session.stamps.tolist()
+        found = [cv2.imread(str(out / file), cv2.IMREAD_UNCHANGED) for _, file in rows]
+        assert np.array_equal(np.stack(found), images)
 
 
 def test_the_arm_alone_until_ctrl_c(tmp_path: Path) -> None:

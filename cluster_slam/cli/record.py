@@ -143,8 +143,7 @@ def _record(
     check_free(out)
     camera = open_camera(camera_name)
     header = live_header(mount, id=id_ or out.name, plant=plant)
-    scale = getattr(camera, "depth_scale", None)
-    head = session_toml(head_of(header, depth_scale=scale, source=f"recorded from {host}, camera {camera_name}"))
+    head = session_toml(head_of(header, camera, source=f"recorded from {host}, camera {camera_name}"))
     waiting: list[RobotSample] = []
     told: list[Notice] = []
     with Stop() as stop:
@@ -155,6 +154,7 @@ def _record(
             begin = time.monotonic()
             while not (stop.is_asked or camera.is_over or (duration and time.monotonic() - begin > duration)):
                 _step(source, journal, waiting, told)
+                journal.intrinsics(camera.intrinsics)
                 progress(_words(journal, told), 0.0 if not duration else (time.monotonic() - begin) / duration)
             _last_views(source, journal, waiting, told)
     return told

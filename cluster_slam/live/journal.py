@@ -17,8 +17,9 @@ from types import TracebackType
 import numpy as np
 
 from cluster_slam.errors import OutputError
-from cluster_slam.io.importers.session_files import COV_NAMES, check_free, number
+from cluster_slam.io.importers.session_files import COV_NAMES, camera_yaml, check_free, number
 from cluster_slam.live.view import Notice, View
+from cluster_slam.sensors.camera import Camera
 from cluster_slam.sensors.rtde.link import RobotSample
 
 ROBOT_COLUMNS = (
@@ -64,6 +65,7 @@ class Journal:
         self._files: dict[str, TextIOWrapper] = {}
         self._head = head
         self._synced = time.monotonic()
+        self._has_camera = False
         self.n_samples = self.n_views = 0
 
     def __enter__(self) -> Journal:
@@ -106,6 +108,12 @@ class Journal:
             self._write("rows.csv", [word, *("" if x != x else number(x) for x in numbers)])
         self._images(view, word)
         self._write("frames.csv", [word, number(view.stamp), number(view.arrival), str(len(view.points))])
+
+    def intrinsics(self, camera: Camera | None) -> None:
+        """The camera of the images, once it is known."""
+        if camera is not None and not self._has_camera:
+            (self.folder / "camera.yaml").write_text(camera_yaml(camera), "utf-8")
+            self._has_camera = True
 
     def notices(self, notices: Iterable[Notice]) -> None:
         """What happened."""

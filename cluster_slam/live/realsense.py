@@ -11,6 +11,7 @@ import numpy as np
 
 from cluster_slam.errors import InputError
 from cluster_slam.geometry import Array
+from cluster_slam.io.importers.session_files import DepthCamera
 from cluster_slam.live.view import View, empty_view
 from cluster_slam.sensors.camera import Camera
 
@@ -21,7 +22,9 @@ class RealSenseCamera:
     Stamps are the camera's, in seconds; with global time, librealsense's default, that is this machine's clock.
     """
 
-    def __init__(self, queue: Any, stop: Callable[[], None], depth_scale: float) -> None:
+    def __init__(
+        self, queue: Any, stop: Callable[[], None], depth_scale: float, depth_camera: DepthCamera | None = None
+    ) -> None:
         """
         Parameters
         ----------
@@ -31,11 +34,14 @@ class RealSenseCamera:
             Ends it.
         depth_scale
             Metres per unit of the depth images.
+        depth_camera
+            Whose depth it is, where that is known.
         """
         import pyrealsense2 as rs
 
-        self.depth_scale = depth_scale
-        self.camera: Camera | None = None  # intrinsics, known with the first view
+        self.depth_scale: float | None = depth_scale
+        self.depth_camera = depth_camera
+        self.intrinsics: Camera | None = None  # known with the first view
         self._queue, self._stop = queue, stop
         self._align = rs.align(rs.stream.color)
         self._last: float | None = None
@@ -71,7 +77,7 @@ class RealSenseCamera:
         if stamp == self._last:
             return None
         self._last = stamp
-        self.camera = self.camera or camera_of(colour.get_profile().as_video_stream_profile().get_intrinsics())
+        self.intrinsics = self.intrinsics or camera_of(colour.get_profile().as_video_stream_profile().get_intrinsics())
         seen = empty_view(stamp, time.time())
         image = np.array(colour.get_data(), np.uint8)
         if "rgb8" in str(colour.get_profile().format()):
@@ -127,5 +133,12 @@ def open_realsense(*, serial: str | None = None, width: int = 848, height: int =
         profile = pipeline.start(config)
     except RuntimeError as error:
         raise InputError(f"camera realsense: {error}, expected a RealSense with {width} x {height} at {fps}") from None
-    scale = float(profile.get_device().first_depth_sensor().get_depth_scale())
-    return RealSenseCamera(pipeline, pipeline.stop, scale)
+    device = profile.get_device()
+    scale = float(device.first_depth_sensor().get_depth_scale())
+    return RealSenseCamera(pipeline, pipeline.stop, scale, _model(str(device.get_info(rs.camera_info.name))))
+
+
+def _model(name: str) -> DepthCamera | None:
+    """How the depths of a camera err, by its name: ``Intel RealSense D435I`` is a D435."""
+    words = name.lower()
+    return "d405" if "d405" in words else "d435" if "d435" in words else None

@@ -9,7 +9,7 @@ from types import TracebackType
 import numpy as np
 
 from cluster_slam.live.robot_poses import PoseAnswer, PoseState, RobotPoses
-from cluster_slam.live.view import Camera, Notice, NoticeKind, View
+from cluster_slam.live.view import LiveCamera, Notice, NoticeKind, View
 from cluster_slam.records import Frame, Session
 from cluster_slam.sensors.clock import ClockEstimator
 from cluster_slam.sensors.rtde.link import LinkEvent, RobotLink, RobotSample
@@ -30,7 +30,7 @@ class RobotSource:
     def __init__(
         self,
         link: RobotLink,
-        camera: Camera,
+        camera: LiveCamera,
         header: Session,
         *,
         detector: Detector | None = None,

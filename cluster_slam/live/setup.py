@@ -15,10 +15,11 @@ import numpy as np
 
 from cluster_slam.errors import ConfigError, InputError
 from cluster_slam.geometry import Array, pose_from_tum, tum_from_pose
-from cluster_slam.io.importers.session_files import SessionHead
+from cluster_slam.io.importers.session_files import DepthCamera, SessionHead
 from cluster_slam.io.text import read_text
-from cluster_slam.live.view import Camera, View
+from cluster_slam.live.view import LiveCamera, View
 from cluster_slam.records import Observations, Session, StatedNoise
+from cluster_slam.sensors.camera import Camera
 
 UNKNOWN_M, UNKNOWN_RAD = 1.0, 3.0  # sigmas of a hand-eye transform that nobody has measured
 _NORM_TOLERANCE = 0.01
@@ -93,7 +94,7 @@ def live_header(mount: Mount, *, id: str | None = None, plant: str | None = None
     )
 
 
-def head_of(header: Session, *, depth_scale: float | None = None, source: str | None = None) -> SessionHead:
+def head_of(header: Session, camera: LiveCamera, *, source: str | None = None) -> SessionHead:
     """What ``session.toml`` says of a live session."""
     T = header.T_flange_camera
     return SessionHead(
@@ -104,7 +105,8 @@ def head_of(header: Session, *, depth_scale: float | None = None, source: str | 
         None if T is None else tum_from_pose(T),
         (header.noise.hand_eye_translation, header.noise.hand_eye_rotation),
         (header.noise.pose_translation, header.noise.pose_rotation),
-        depth_scale=depth_scale,
+        depth_scale=camera.depth_scale,
+        depth_camera=camera.depth_camera,
         source=source,
     )
 
@@ -112,7 +114,9 @@ def head_of(header: Session, *, depth_scale: float | None = None, source: str | 
 class NoCamera:
     """A camera that is not there: the robot alone."""
 
+    intrinsics: Camera | None = None
     depth_scale: float | None = None
+    depth_camera: DepthCamera | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -132,7 +136,7 @@ class NoCamera:
         return []
 
 
-def open_camera(name: str) -> Camera:
+def open_camera(name: str) -> LiveCamera:
     """The camera that a command names: ``none``, ``realsense`` (``realsense:SERIAL``), or a folder that grows.
 
     Raises

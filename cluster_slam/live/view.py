@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cluster_slam.geometry import Array
+from cluster_slam.io.importers.session_files import DepthCamera
 from cluster_slam.records import Frame, Session
+from cluster_slam.sensors.camera import Camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,8 +35,12 @@ def empty_view(stamp: float, arrival: float) -> View:
     return View(stamp, arrival, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))
 
 
-class Camera(Protocol):
+class LiveCamera(Protocol):
     """Something that gives views: a folder that grows, a RealSense. Used as a context manager."""
+
+    intrinsics: Camera | None  # of the images, as soon as they are known
+    depth_scale: float | None  # m per unit of the depth images
+    depth_camera: DepthCamera | None  # whose depth it is
 
     def __enter__(self) -> Self: ...
 

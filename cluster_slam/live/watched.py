@@ -15,10 +15,14 @@ import numpy as np
 
 from cluster_slam.errors import InputError
 from cluster_slam.geometry import Array
+from cluster_slam.io.camera_info import read_camera
 from cluster_slam.io.flowers import POINT_COV, symmetric
+from cluster_slam.io.importers.session_files import DepthCamera
 from cluster_slam.io.metadata import read_metadata
+from cluster_slam.io.session import stated_noise
 from cluster_slam.live.view import View, empty_view
 from cluster_slam.records import StatedNoise
+from cluster_slam.sensors.camera import Camera
 
 _SETTLE_S = 0.2  # a frame whose rows stop coming is complete after so long
 _LOOK_S = 0.01  # between two looks into the folder
@@ -162,7 +166,12 @@ class WatchedFolder:
         if not folder.is_dir():
             raise InputError(f"{folder}: missing, expected a folder that a camera's program fills")
         self._folder = folder
-        self._table = WatchedTable(folder, _noise(folder))
+        metadata = read_metadata(folder / "session.toml")[0] if (folder / "session.toml").exists() else None
+        own = folder / "camera.yaml"
+        self.intrinsics: Camera | None = read_camera(own) if own.exists() else None
+        self.depth_scale: float | None = metadata.depth.scale if metadata else 0.001 if own.exists() else None
+        self.depth_camera: DepthCamera | None = metadata.depth.camera if metadata else None
+        self._table = WatchedTable(folder, StatedNoise() if metadata is None else stated_noise(metadata))
         self._images = WatchedImages(folder)
         self._is_over = False
         self._looked = -float("inf")  # monotonic
@@ -189,10 +198,3 @@ class WatchedFolder:
         views = self._table.take() if (self._folder / "flowers.csv").exists() else self._images.take()
         self._is_over = is_done and not views and self._table.is_empty
         return views
-
-
-def _noise(folder: Path) -> StatedNoise:
-    from cluster_slam.io.session import stated_noise
-
-    path = folder / "session.toml"
-    return stated_noise(read_metadata(path)[0]) if path.exists() else StatedNoise()

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from cluster_slam.io.result import stamp_words
 from cluster_slam.records import PoseError, PoseFrame
 from cluster_slam.sensors.camera import Camera
 
+DepthCamera = Literal["generic", "d405", "d435"]
 COV_NAMES = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
 
 
@@ -35,6 +37,7 @@ class SessionHead:
     pose_sigmas: tuple[float, float] | None = None  # m, rad
     max_time_difference_s: float | None = None
     depth_scale: float | None = None  # m per unit of the images
+    depth_camera: DepthCamera | None = None  # how its depths err
     source: str | None = None  # where it comes from, in words
 
 
@@ -92,6 +95,7 @@ def session_toml(head: SessionHead) -> str:
         lines.append(f"max_time_difference = {number(head.max_time_difference_s)}")
     if head.depth_scale is not None:
         lines += ["", "[depth]", f"scale = {number(head.depth_scale)}", 'convention = "z"']
+        lines += [f'camera = "{head.depth_camera}"'] if head.depth_camera is not None else []
     sigmas = {"pose": head.pose_sigmas, "hand_eye": head.hand_eye_sigmas}
     stated = {name: pair for name, pair in sigmas.items() if pair is not None}
     lines += ["", "[noise]"] if stated else []
