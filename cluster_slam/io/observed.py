@@ -80,6 +80,7 @@ def observe_pictures(
             convention=metadata.depth.convention,
             model=model,
             sigma_px=sigma_px,
+            image=shot.colour,
         )
         rows.append((shot.frame, boxes, sigma_px, lifted))
     return _together(rows, seen)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cluster_slam.geometry import Array
 from cluster_slam.lift.petals import NO_DEPTH, petal_depth
@@ -12,6 +13,9 @@ from cluster_slam.lift.points import Convention, lift_unscented
 from cluster_slam.records import BoolArray, ImageDetections
 from cluster_slam.sensors.camera import Camera
 from cluster_slam.sensors.depth import DepthModel
+
+_ALIKE = 1.8  # flowers of one picture differ in width by less than this factor from the middle one
+_MIN_ALIKE = 5  # flowers that say what is usual
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,6 +37,7 @@ def lift_boxes(
     convention: Convention,
     model: DepthModel,
     sigma_px: Array,
+    image: NDArray[np.uint8] | None = None,
 ) -> LiftedBoxes:
     """Points of all boxes that have a depth.
 
@@ -50,17 +55,22 @@ def lift_boxes(
         How its pixels err, and how well the intrinsics are known.
     sigma_px
         (k,) sigma of u and of v of the boxes' middles.
+    image
+        (h, w, 3) the colour picture, which helps to tell petals from what is before and behind; None: there is none.
     """
     focal = (camera.fx + camera.fy) / 2
+    table = np.column_stack([boxes.centres, boxes.sizes])
     found = [
-        petal_depth(depth, centre, size, focal, model) if size.min() > 0 else NO_DEPTH
-        for centre, size in zip(boxes.centres, boxes.sizes, strict=True)
+        petal_depth(depth, box[:2], box[2:], focal, model, image, _reaching(table, k))
+        if box[2:].min() > 0
+        else NO_DEPTH
+        for k, box in enumerate(table)
     ]
     depths = np.array([f.depth for f in found])
     sigmas = np.array([f.sigma for f in found])
     slopes = np.array([(f.slope_u, f.slope_v) for f in found]).reshape(-1, 2)
     points, covs = np.full((len(found), 3), np.nan), np.full((len(found), 3, 3), np.nan)
-    good = np.isfinite(depths)
+    good = np.isfinite(depths) & _are_alike(boxes.sizes.max(axis=1, initial=0.0) * depths)
     if good.any():
         points[good], covs[good] = lift_unscented(
             camera,
@@ -75,3 +85,21 @@ def lift_boxes(
         )
     good &= np.isfinite(points).all(1)
     return LiftedBoxes(depths, sigmas, points, covs, good)
+
+
+def _reaching(table: Array, k: int) -> Array:
+    """The boxes (m, 4) that touch box k."""
+    away = np.abs(table[:, :2] - table[k, :2])
+    touches = (away < (table[:, 2:] + table[k, 2:]) / 2 + table[k, 2:] / 2).all(1)
+    touches[k] = False
+    return table[touches]
+
+
+def _are_alike(widths: Array) -> BoolArray:
+    """Which flowers are about as large as most in the picture: at a wrong depth they would not be."""
+    known = widths[np.isfinite(widths)]
+    if len(known) < _MIN_ALIKE:
+        return np.ones(len(widths), bool)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        alike: BoolArray = ~(np.abs(np.log(widths / np.median(known))) > np.log(_ALIKE))
+    return alike

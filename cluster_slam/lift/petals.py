@@ -11,15 +11,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cluster_slam.geometry import Array
+from cluster_slam.records import BoolArray
 from cluster_slam.sensors.depth import DepthModel
 
 _INNER = 0.95  # share of the box that is looked at: an ellipse
 _CENTRED = 0.55  # sigma of the weight that falls from the middle, in half-axes
 _TILT = 0.7  # sigma of the tangent of a flower's tilt
-_RELIEF = 0.10  # sigma of petals about a plane, in half widths of the flower
-_MIN_WEIGHT = 0.06  # of the petals, of all that an empty box could have: fewer is no depth
+_RELIEF = 0.07  # sigma of petals about a plane, in half widths of the flower
+_DEEP = (0.3, 0.9)  # depth of a flower, in widths: one that faces the camera, and one that does not
+_GOES_ON = 1.2  # weight of what goes on beyond the box, in depth ...
+_THIN = 3.0  # ... and in colour: a stem has this many times its share of the ring in the box
+_RING = (1.3, 1.9)  # about the ellipse, in half-axes
+_MIN_SCORE = 0.15  # of the petals: their weight in the box less their share of the ring
+_ALL = 0.85  # of the weight in the box: what holds so much has no rival ...
+_MIN_ALL = 0.3  # ... if it is so much of a whole box
+_DOUBT = 0.3  # a rival that scores so much of the best leaves no depth
 _TUKEY = 4.0  # sigmas at which a pixel counts no more
 
 
@@ -31,13 +40,20 @@ class PetalDepth:
     sigma: float  # m
     slope_u: float  # m / px
     slope_v: float
-    support: float  # weight of the pixels that agree, 0 to 1
 
 
-NO_DEPTH = PetalDepth(np.nan, np.nan, 0.0, 0.0, 0.0)
+NO_DEPTH = PetalDepth(np.nan, np.nan, 0.0, 0.0)
 
 
-def petal_depth(depth: Array, centre: Array, size: Array, focal_px: float, model: DepthModel) -> PetalDepth:
+def petal_depth(
+    depth: Array,
+    centre: Array,
+    size: Array,
+    focal_px: float,
+    model: DepthModel,
+    image: NDArray[np.uint8] | None = None,
+    others: Array | None = None,
+) -> PetalDepth:
     """The depth at the middle of a flower's box.
 
     Parameters
@@ -50,67 +66,115 @@ def petal_depth(depth: Array, centre: Array, size: Array, focal_px: float, model
         Of the depth image.
     model
         How its pixels err.
+    image
+        (h, w, 3) the colour picture; None: depths alone say what is a petal.
+    others
+        (k, 4) middle and size of further boxes that reach into this one: a pixel is of the box whose middle is nearer.
     """
-    u, v, z, weight, possible = _pixels(depth, centre, size)
-    if not len(z):
+    patch = _patch(depth, centre, size, image, np.empty((0, 4)) if others is None else others)
+    if not len(patch.z):
         return NO_DEPTH
     width_px = float(np.sqrt(size[0] * size[1]))
-    petals, rival = _front(z, weight, width_px / focal_px, model)
-    support = float(weight[petals].sum()) / possible
-    if support < _MIN_WEIGHT or petals.sum() < 3:
+    petals = _petals(patch, width_px / focal_px, model)
+    if petals.sum() < 3:
         return NO_DEPTH
-    fitted = _plane(u[petals], v[petals], z[petals], weight[petals], width_px, focal_px, model)
-    value, sigma, b, c = fitted
-    return PetalDepth(value, float(np.hypot(sigma, rival)), b, c, support)
+    u, v, z, weight = patch.u[petals], patch.v[petals], patch.z[petals], patch.weight[petals]
+    return _plane(u, v, z, weight, width_px, focal_px, model)
 
 
-def _pixels(depth: Array, centre: Array, size: Array) -> tuple[Array, Array, Array, Array, float]:
-    """Offsets u and v, depth and weight of the valid pixels in the box's ellipse, and the weight of all of them."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Patch:
+    """The valid pixels in a box's ellipse, and the depths in a ring about it."""
+
+    u: Array  # (n,) from the middle, px
+    v: Array
+    z: Array  # (n,) m
+    weight: Array  # (n,) falls from the middle; sums to 1 where all pixels are valid
+    ring: Array  # (m,) m, increasing
+    n_ring: int  # pixels of the ring, valid or not
+
+
+def _patch(depth: Array, centre: Array, size: Array, image: NDArray[np.uint8] | None, others: Array) -> _Patch:
     half = np.maximum(_INNER * size / 2, 1.6)
-    low = np.maximum(np.ceil(centre - half).astype(int), 0)
-    high = np.minimum(np.floor(centre + half).astype(int) + 1, depth.shape[::-1])
-    if (high <= low).any():
-        return (*(np.empty(0),) * 4, 1.0)
+    low = np.maximum(np.ceil(centre - _RING[1] * half).astype(int), 0)
+    high = np.maximum(np.minimum(np.floor(centre + _RING[1] * half).astype(int) + 1, depth.shape[::-1]), low)
     patch = depth[low[1] : high[1], low[0] : high[0]]
-    dv, du = np.mgrid[low[1] : high[1], low[0] : high[0]]
-    du, dv = du - centre[0], dv - centre[1]
-    r2 = (du / half[0]) ** 2 + (dv / half[1]) ** 2
-    weight = np.where(r2 <= 1.0, np.exp(-0.5 * r2 / _CENTRED**2), 0.0)
-    valid = (patch > 0) & (weight > 0)
-    return du[valid], dv[valid], patch[valid].astype(float), weight[valid], float(weight.sum())
+    u = np.arange(low[0], high[0]) - centre[0]
+    v = (np.arange(low[1], high[1]) - centre[1])[:, None]
+    r2 = (u / half[0]) ** 2 + (v / half[1]) ** 2
+    foreign = _nearest_other(u + centre[0], v + centre[1], others)
+    inside = (r2 <= 1.0) & (r2 <= foreign)
+    weight = np.where(inside, np.exp(-0.5 * r2 / _CENTRED**2), 0.0)
+    about = (r2 >= _RING[0] ** 2) & (r2 <= _RING[1] ** 2) & (foreign > 1.0)
+    whole = max(float(np.exp(-0.5 * r2[r2 <= 1.0] / _CENTRED**2).sum()), 1e-9)
+    if image is not None:
+        weight = weight * _petal_coloured(image[low[1] : high[1], low[0] : high[0]], weight, about)
+    valid = (patch > 0) & inside
+    uu, vv = np.broadcast_arrays(u, v)
+    return _Patch(
+        uu[valid],
+        vv[valid],
+        patch[valid].astype(float),
+        weight[valid] / whole,
+        np.sort(patch[about & (patch > 0)].astype(float)),
+        int(about.sum()),
+    )
 
 
-def _front(z: Array, weight: Array, width: float, model: DepthModel) -> tuple[Array, float]:
-    """Which pixels are the petals, and the sigma of having taken the wrong ones, m."""
-    order = np.argsort(z, kind="stable")
-    zs, total = z[order], np.concatenate([[0.0], np.cumsum(weight[order])])
-    reach = 0.9 * width * zs + 4.0 * model.sigma(zs)
-    end = np.searchsorted(zs, zs + reach, side="right")
-    inside = total[end] - total[:-1]
-    best = int((inside > 0.999 * inside.max()).argmax())  # of equals, the nearest
+def _nearest_other(u: Array, v: Array, others: Array) -> Array:
+    """Squared distance (h, w) to the middle of the nearest other box, in its half-axes."""
+    nearest = np.full(np.broadcast_shapes(u.shape, v.shape), np.inf)
+    for x, y, w, h in others:
+        half_w, half_h = max(_INNER * w / 2, 1.6), max(_INNER * h / 2, 1.6)
+        nearest = np.minimum(nearest, ((u - x) / half_w) ** 2 + ((v - y) / half_h) ** 2)
+    return nearest
+
+
+def _petal_coloured(image: NDArray[np.uint8], weight: Array, about: BoolArray) -> Array:
+    """How likely (h, w) a pixel's colour is the flower's: what is common in the box and rare in the ring about it."""
+    levels = (image >> 6).astype(np.int64)
+    colour = levels[..., 0] * 16 + levels[..., 1] * 4 + levels[..., 2]
+    inside = np.bincount(colour.ravel(), weight.ravel(), 64) / max(float(weight.sum()), 1e-9)
+    beyond = np.bincount(colour[about], minlength=64) / max(int(about.sum()), 1)
+    share: Array = ((inside + 0.005) / (inside + _THIN * beyond + 0.01))[colour]
+    return np.clip(3.0 * share - 1.3, 0.0, 1.0)
+
+
+def _petals(patch: _Patch, width: float, model: DepthModel) -> BoolArray:
+    """Which pixels are the petals; none where something else may as well be.
+
+    Depths that fit into one flower count by their weight in the box, less their share of the ring: what goes on beyond
+    the box, as leaves before and behind do, is not the flower.
+    """
+    order = np.argsort(patch.z, kind="stable")
+    z = patch.z[order]
+    total = np.concatenate([[0.0], np.cumsum(patch.weight[order])])
+    windows = [z + deep * width * z + 4.0 * model.sigma(z) for deep in _DEEP]
+    low, high = np.tile(z, len(windows)), np.concatenate(windows)
+    begin, end = np.tile(np.arange(len(z)), len(windows)), np.searchsorted(z, high, side="right")
+    beyond = np.searchsorted(patch.ring, high, side="right") - np.searchsorted(patch.ring, low)
+    held = total[end] - total[begin]
+    score = held - _GOES_ON * beyond / max(patch.n_ring, 1)
+    if held.max() > max(_ALL * total[-1], _MIN_ALL):  # nothing else is in the box: a flower on a leaf as deep as it
+        score = held
+    best = int(score.argmax())
     chosen = np.zeros(len(z), bool)
-    chosen[order[best : end[best]]] = True
-    rest = ~chosen
-    middle = float(np.median(z[chosen]))
-    if not rest.any():
-        return chosen, 0.0
-    apart = (zs > zs[end[best] - 1]) | (zs < zs[best])
-    others = np.where(apart, np.minimum(inside, total[-1] - inside[best]), 0.0)
-    second = int(others.argmax())
-    doubt = float(others[second] / (inside[best] + others[second]))
-    doubt = max(0.0, doubt - 0.3) * 0.5  # a rival of less than three in ten is none
-    distance = float(zs[second] - middle)
-    return chosen, float(np.sqrt(doubt * (1 - doubt)) * abs(distance))
+    chosen[order[begin[best] : end[best]]] = True
+    apart = (low > high[best]) | (high < low[best])
+    rival = float(score[apart].max(initial=0.0))
+    if score[best] < _MIN_SCORE or rival > _DOUBT * score[best]:
+        return np.zeros(len(z), bool)
+    return chosen
 
 
 def _plane(
     u: Array, v: Array, z: Array, weight: Array, width_px: float, focal_px: float, model: DepthModel
-) -> tuple[float, float, float, float]:
+) -> PetalDepth:
     """Depth at the middle, its sigma, and the slopes, by least squares that let go of what does not fit."""
     middle = float(np.median(z))
     noise = float(model.sigma(np.array([middle]))[0])
     relief = _RELIEF * 0.5 * width_px * middle / focal_px
-    pixel_var = noise**2 + relief**2
+    noise_var = noise**2
     alike = 1.0 + len(z) / (4.0 * np.pi * model.correlation_px**2)  # so many pixels tell something of their own
     share = min(1.0, alike / len(z))
     prior = np.diag([0.0, 1.0, 1.0]) / (_TILT * middle / focal_px) ** 2
@@ -118,12 +182,13 @@ def _plane(
     robust = np.ones(len(z))
     solution = np.array([middle, 0.0, 0.0])
     for _ in range(4):
-        A = X.T @ (X * (robust * weight / weight.mean())[:, None]) * (share / pixel_var) + prior
-        y = X.T @ (z * robust * weight / weight.mean()) * (share / pixel_var)
+        A = X.T @ (X * (robust * weight / weight.mean())[:, None]) * (share / noise_var) + prior
+        y = X.T @ (z * robust * weight / weight.mean()) * (share / noise_var)
         solution = np.linalg.solve(A, y)
         residual = z - X @ solution
-        scale = max(np.sqrt(pixel_var), 1.4826 * float(np.median(np.abs(residual))))
+        scale = max(float(np.hypot(noise, relief)), 1.4826 * float(np.median(np.abs(residual))))
         robust = np.maximum(1.0 - (residual / (_TUKEY * scale)) ** 2, 0.0) ** 2
-    variance = float(np.linalg.solve(A, np.eye(3)[0])[0]) * max(1.0, scale**2 / pixel_var)
+    variance = float(np.linalg.solve(A, np.eye(3)[0])[0]) * max(1.0, scale**2 / (noise_var + relief**2))
     step = model.unit_m**2 / 12.0
-    return float(solution[0]), float(np.sqrt(variance + relief**2 + step)), float(solution[1]), float(solution[2])
+    sigma = float(np.sqrt(variance + relief**2 + step))
+    return PetalDepth(float(solution[0]), sigma, float(solution[1]), float(solution[2]))

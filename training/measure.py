@@ -1,0 +1,170 @@
+"""Measure a detector: on renderings of plants it has not seen, and on annotated pictures (COCO).
+
+    python training/measure.py cluster_slam/detect/models/flowers.onnx --worlds 20
+    python training/measure.py colour --coco FOLDER/annotations.coco.json
+
+With ``--calibrate`` the measured error of the boxes' middles is written into the model's metadata.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+from pictures import HIDDEN, N_FRAMES, SEEN, render_world
+
+from cluster_slam.detect import open_detector
+from cluster_slam.records import ImageDetections
+from cluster_slam.simulate.config import MODERATE
+from cluster_slam.simulate.render.frames import Renderer
+from cluster_slam.simulate.session import simulate_session
+
+HELD_OUT = 90_000  # first seed of the worlds that no training sees
+_MIN_PX = 6.0  # a flower smaller than that is neither wanted nor wrong
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("model", help="an ONNX file, own, or colour")
+    options.add_argument("--worlds", type=int, default=12)
+    options.add_argument("--usual", action="store_true", help="plants and light of a usual session, not random ones")
+    options.add_argument("--coco", type=Path)
+    options.add_argument("--category", default="flower")
+    options.add_argument("--calibrate", action="store_true")
+    chosen = options.parse_args()
+    is_file = chosen.model.endswith(".onnx")
+    detector = open_detector(chosen.model if is_file else None, name=None if is_file else chosen.model, score=0.02)
+    if chosen.coco is not None:
+        tables = annotated(detector, chosen.coco, chosen.category)
+    else:
+        tables = rendered(detector, chosen.worlds, chosen.usual)
+    scores, hits, n_wanted, errors = (
+        np.concatenate([t[0] for t in tables]),
+        np.concatenate([t[1] for t in tables]),
+        sum(t[2] for t in tables),
+        np.concatenate([t[3] for t in tables]),
+    )
+    report(scores, hits, n_wanted)
+    if len(errors):
+        a, b = centre_sigma(errors)
+        print(f"middle of a box: sigma of u and of v = hypot({a:.2f} px, {b:.3f} of its size)")
+        if chosen.calibrate:
+            state(Path(chosen.model), {"sigma_px": f"{a:.3f} {b:.4f}", "pixel_origin": "centre"})
+
+
+def rendered(detector: object, n_worlds: int, usual: bool) -> list[tuple]:
+    """Matches in the pictures of held-out worlds."""
+    tables = []
+    for seed in range(HELD_OUT, HELD_OUT + n_worlds):
+        for picture in usual_world(seed) if usual else render_world(seed):
+            b = picture.boxes
+            is_big = b.sizes.max(1) >= _MIN_PX
+            height, width = picture.colour.shape[:2]
+            inside = (b.centres > 3).all(1) & (b.centres < [width - 4, height - 4]).all(1)
+            wanted = (b.visible >= SEEN) & is_big & inside
+            known = b.visible >= HIDDEN
+            found = detector.detect(picture.colour)
+            tables.append(matched(found, np.column_stack([b.centres, b.sizes]), wanted, known & ~wanted))
+    return tables
+
+
+def usual_world(seed: int) -> list:
+    config = replace(MODERATE, level=1, fps=N_FRAMES / 30.0)
+    renderer = Renderer(simulate_session(config, seed=seed), seed=seed)
+    return [renderer.frame(k) for k in range(N_FRAMES)]
+
+
+def annotated(detector: object, path: Path, category: str) -> list[tuple]:
+    """Matches in the pictures of a COCO file."""
+    content = json.loads(path.read_text("utf-8"))
+    wanted = {c["id"] for c in content["categories"] if c["name"] == category}
+    tables = []
+    for entry in content["images"]:
+        image = cv2.imread(str(path.parent / entry["file_name"]))
+        rows = [
+            a["bbox"] for a in content["annotations"] if a["image_id"] == entry["id"] and a["category_id"] in wanted
+        ]
+        corner = np.array(rows, float).reshape(-1, 4)
+        boxes = np.column_stack([corner[:, :2] + corner[:, 2:] / 2 - 0.5, corner[:, 2:]])
+        found = detector.detect(image)
+        tables.append(matched(found, boxes, np.ones(len(boxes), bool), np.zeros(len(boxes), bool)))
+    return tables
+
+
+def matched(found: ImageDetections, boxes: np.ndarray, wanted: np.ndarray, ignored: np.ndarray) -> tuple:
+    """Scores and hits (IoU 0.5, best score first, each box once), how many were wanted, errors of the middles."""
+    scores, hits, errors, taken = [], [], [], np.zeros(len(boxes), bool)
+    for k in range(len(found)):
+        overlap = iou(np.concatenate([found.centres[k], found.sizes[k]]), boxes)
+        free = np.where(wanted & ~taken, overlap, 0.0)
+        j = int(free.argmax()) if len(free) else -1
+        if j >= 0 and free[j] >= 0.5:
+            taken[j] = True
+            scores.append(found.scores[k])
+            hits.append(True)
+            if found.scores[k] > 0.35:
+                errors.append([*(found.centres[k] - boxes[j, :2]), np.sqrt(boxes[j, 2:].prod())])
+        elif not (len(overlap) and (np.where(ignored, overlap, 0.0) > 0.3).any()):
+            scores.append(found.scores[k])
+            hits.append(False)
+    return np.array(scores), np.array(hits, bool), int(wanted.sum()), np.array(errors).reshape(-1, 3)
+
+
+def iou(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Intersection over union of one box (4,) with others (k, 4), each as middle and size."""
+    low = np.maximum(box[:2] - box[2:] / 2, boxes[:, :2] - boxes[:, 2:] / 2)
+    high = np.minimum(box[:2] + box[2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2)
+    shared = np.maximum(high - low, 0.0).prod(1)
+    return shared / (box[2:].prod() + boxes[:, 2:].prod(1) - shared + 1e-9)
+
+
+def report(scores: np.ndarray, hits: np.ndarray, n_wanted: int) -> None:
+    """Precision and recall over the least score."""
+    order = np.argsort(-scores, kind="stable")
+    true = np.cumsum(hits[order])
+    recall, precision = true / max(n_wanted, 1), true / np.arange(1, len(true) + 1)
+    print(f"{n_wanted} flowers, {len(scores)} boxes")
+    for least in (0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6):
+        k = int((scores >= least).sum()) - 1
+        if k >= 0:
+            print(f"score {least:.2f}: precision {precision[k]:.3f}, recall {recall[k]:.3f}")
+    for wanted in (0.5, 0.7, 0.8, 0.9):
+        at = recall >= wanted
+        best = f"{precision[at].max():.3f}" if at.any() else "not reached"
+        print(f"at recall {wanted}: precision {best}")
+
+
+def centre_sigma(errors: np.ndarray) -> tuple[float, float]:
+    """Constant and share of the size, by least squares on robust variances in bins of the size."""
+    edges = np.quantile(errors[:, 2], np.linspace(0, 1, 9))
+    rows = []
+    for low, high in pairwise(edges):
+        part = errors[(errors[:, 2] >= low) & (errors[:, 2] <= high)]
+        rows.append([np.mean(part[:, 2] ** 2), np.mean(np.minimum(part[:, :2] ** 2, (0.3 * part[:, 2:]) ** 2))])
+    size_sq, variance = np.array(rows).T
+    X = np.column_stack([np.ones(len(rows)), size_sq]) / variance[:, None]
+    a, b = np.linalg.lstsq(X, np.ones(len(rows)), rcond=None)[0]
+    return float(np.sqrt(max(a, 0.04))), float(np.sqrt(max(b, 0.0)))
+
+
+def state(path: Path, more: dict[str, str]) -> None:
+    """Set entries of a model's metadata."""
+    import onnx
+
+    model = onnx.load(str(path))
+    for entry in list(model.metadata_props):
+        if entry.key in more:
+            model.metadata_props.remove(entry)
+    for key, value in sorted(more.items()):
+        entry = model.metadata_props.add()
+        entry.key, entry.value = key, value
+    onnx.save(model, str(path))
+
+
+if __name__ == "__main__":
+    main()
