@@ -94,11 +94,17 @@ def test_late_arrivals_do_not_move_the_poses() -> None:
 
 def test_a_changed_tool_is_told() -> None:
     poses = RobotPoses()
-    first = [sample(0.01 * k, 0.0, joints=(0.1, *STILL[1:])) for k in range(5)]
-    assert poses.add(first) == []
-    told = poses.add([sample(0.05, 0.02, joints=(0.1, *STILL[1:]))])
+    assert poses.add([sample(0.01 * k, 0.01 * k) for k in range(5)]) == []
+    last = (0.04, *STILL[1:])
+    told = poses.add([sample(0.05, 0.04, joints=last), sample(0.06, 0.06, joints=last)])
     assert len(told) == 1
     assert "TCP" in told[0]
+
+
+def test_joints_that_never_move_tell_nothing() -> None:
+    """A controller that has no joints says zero for ever."""
+    poses = RobotPoses()
+    assert poses.add([sample(0.01 * k, 0.01 * k, joints=(0.0,) * 6) for k in range(9)]) == []
 
 
 def test_memory_stays_bounded() -> None:
@@ -153,6 +159,9 @@ def test_rows_as_they_are_added(tmp_path: Path) -> None:
         assert take(camera, 0.3) == [(2.0, 1)]  # nothing came for a while
         file.write("rubbish\n3.0,a,b,c,d\n3.0,1,2,3,0.5\n4.0,1,1,1,1\n")
     assert take(camera) == [(3.0, 1)]
+    (problem,) = camera.problems()
+    assert "flowers.csv: 'rubbish' is no row of timestamp,x,y,z,score" in problem
+    assert camera.problems() == []
     (tmp_path / "done").touch()
     assert take(camera, 0.3) == [(4.0, 1)]
     assert not camera.is_over

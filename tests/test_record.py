@@ -146,6 +146,23 @@ def test_pictures_on_an_arm(tmp_path: Path) -> None:
         assert np.array_equal(np.stack(found), images)
 
 
+def test_a_camera_that_gives_nothing(tmp_path: Path) -> None:
+    """Rows that are none are told, and a recording without a view is poor."""
+    camera = camera_folder(tmp_path)
+    with EmulatedRobot(line_motion(tmp_path)) as robot:
+        process = recorder(robot, tmp_path / "session", "--camera", str(camera))
+        wait_for(tmp_path / "session.recording" / "robot.csv")
+        (camera / "flowers.csv").write_text("timestamp,x,y,z\n" + "now,1,2,3\n" * 12)
+        time.sleep(0.5)
+        (camera / "done").touch()
+        told = json.loads(process.communicate(timeout=20)[0])
+    assert process.returncode == 1
+    assert told["views"] == 0
+    texts = [text for text in told["notices"] if text.startswith("camera: ")]
+    assert len(texts) == 2
+    assert texts[1].endswith("(10 in all)")
+
+
 def test_the_arm_alone_until_ctrl_c(tmp_path: Path) -> None:
     out = tmp_path / "session"
     with EmulatedRobot(line_motion(tmp_path)) as robot:

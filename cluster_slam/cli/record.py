@@ -76,7 +76,7 @@ def command(
             told = _record(out, robot, camera, duration, rate, mount, plant, id_, progress)
     done = make_session(out)
     warnings = [f"{one.kind.value}: {one.text}" for one in told]
-    reasons = _poor(done)
+    reasons = _poor(done, has_camera=not finish and camera != "none")
     if as_json:
         print_json({"out": str(out), **_facts(done), "notices": warnings, "status": "poor" if reasons else "ok"})
     elif not quiet:
@@ -183,7 +183,9 @@ def _words(journal: Any, told: list[Notice]) -> str:
     return f"{journal.n_samples} samples, {journal.n_views} views{last}"
 
 
-def _poor(done: Finished) -> list[str]:
+def _poor(done: Finished, *, has_camera: bool) -> list[str]:
+    if has_camera and not done.n_views:
+        return ["the camera gave nothing"]
     all_frames = done.n_frames + done.n_without_pose
     if done.n_without_pose > _POOR_SHARE * all_frames:
         return [f"{done.n_without_pose} of {all_frames} frames have no pose, the robot was lost then"]
@@ -194,6 +196,7 @@ def _facts(done: Finished) -> dict[str, Any]:
     clock = done.clocks[-1]
     return {
         "robot_samples": done.n_samples,
+        "views": done.n_views,
         "frames": done.n_frames,
         "frames_without_pose": done.n_without_pose,
         "points": done.n_points,

@@ -25,6 +25,7 @@ class Finished:
     """What a recording holds."""
 
     n_samples: int
+    n_views: int  # of the camera
     n_frames: int  # with a pose
     n_without_pose: int
     n_points: int
@@ -65,7 +66,7 @@ def finish(out: Path) -> Finished:
         raise OutputError(f"{out}: cannot be written ({error.strerror}); the recording stays in {journal}") from None
     n_kept = int(np.isin(points[:, 0], stamps[known]).sum()) if len(points) else 0
     silences = _silences(times)
-    return Finished(len(robot), int(known.sum()), int((~known).sum()), n_kept, clocks, silences)
+    return Finished(len(robot), len(frames), int(known.sum()), int((~known).sum()), n_kept, clocks, silences)
 
 
 def _observations(journal: Path, stamps: Array, points: Array) -> dict[str, str]:

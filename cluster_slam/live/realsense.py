@@ -68,6 +68,10 @@ class RealSenseCamera:
                 views.append(view)
         return views
 
+    def problems(self) -> list[str]:
+        """None: what does not come is not there."""
+        return []
+
     def _view(self, frames: Any) -> View | None:
         if not (frames.get_color_frame() and frames.get_depth_frame()):
             return None

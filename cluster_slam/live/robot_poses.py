@@ -53,6 +53,7 @@ class RobotPoses:
         self._estimator = ClockEstimator()
         self._stretches = [_Stretch()]
         self._last: RobotSample | None = None
+        self._joints_move = False  # ever: else they are not told truly, as by a controller that has none
 
     @property
     def clock(self) -> Clock | None:
@@ -69,7 +70,7 @@ class RobotPoses:
                 stretch = _Stretch()
                 self._stretches = [self._stretches[-1], stretch]
             stretch.clock = self._estimator.clock
-            if self._last is not None and _is_tool_change(self._last, sample):
+            if self._last is not None and self._is_tool_change(self._last, sample):
                 told.append("the pose jumped while the joints stood: was the active TCP changed?")
             self._last = sample
             stretch.stamps.append(sample.stamp)
@@ -91,6 +92,11 @@ class RobotPoses:
             return PoseAnswer(PoseState.LOST)
         return PoseAnswer(PoseState.TOO_OLD)
 
+    def _is_tool_change(self, before: RobotSample, after: RobotSample) -> bool:
+        turned = max(abs(a - b) for a, b in zip(after.joints, before.joints, strict=True))  # NaN without joints
+        self._joints_move = self._joints_move or turned > _JOINTS_STILL_RAD
+        return self._joints_move and turned < _JOINTS_STILL_RAD and _distance(before, after) > _TCP_JUMP_M
+
     def _begin_of_first(self) -> float:
         first = self._stretches[0]
         return float("inf") if first.clock is None else float(first.clock.arrival(np.array([first.stamps[0]]))[0])
@@ -109,7 +115,5 @@ def _between(stretch: _Stretch, stamp: float, *, is_last: bool) -> PoseAnswer:
     return PoseAnswer(PoseState.KNOWN, interpolate(stamps[i - 1 : i + 1], ends, np.array([stamp]))[0])
 
 
-def _is_tool_change(before: RobotSample, after: RobotSample) -> bool:
-    turned = np.abs(np.subtract(after.joints, before.joints)).max()  # NaN without joints: never said
-    moved = np.linalg.norm(np.subtract(after.pose[:3], before.pose[:3]))
-    return bool(turned < _JOINTS_STILL_RAD and moved > _TCP_JUMP_M)
+def _distance(before: RobotSample, after: RobotSample) -> float:
+    return float(np.linalg.norm(np.subtract(after.pose[:3], before.pose[:3])))

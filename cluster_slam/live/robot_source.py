@@ -107,6 +107,8 @@ class RobotSource:
             self._on_samples(samples)
         self._tell(events, self.poses.add(samples))
         self._waiting += self._camera.take()
+        for text in self._camera.problems():
+            self._note(NoticeKind.CAMERA, text)
         if not self._waiting:
             return None
         view = self._waiting[0]

@@ -135,6 +135,10 @@ class NoCamera:
         """Nothing."""
         return []
 
+    def problems(self) -> list[str]:
+        """None."""
+        return []
+
 
 def open_camera(name: str) -> LiveCamera:
     """The camera that a command names: ``none``, ``realsense`` (``realsense:SERIAL``), or a folder that grows.

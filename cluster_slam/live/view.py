@@ -57,6 +57,10 @@ class LiveCamera(Protocol):
         """Views since the last call; never waits."""
         ...
 
+    def problems(self) -> list[str]:
+        """What could not be read since the last call, in words."""
+        ...
+
 
 class FrameSource(Protocol):
     """Something that gives frames with poses, as they come."""

@@ -20,6 +20,7 @@ from cluster_slam.io.flowers import POINT_COV, symmetric
 from cluster_slam.io.importers.session_files import DepthCamera
 from cluster_slam.io.metadata import read_metadata
 from cluster_slam.io.session import stated_noise
+from cluster_slam.io.text import shown
 from cluster_slam.live.view import View, empty_view
 from cluster_slam.records import StatedNoise
 from cluster_slam.sensors.camera import Camera
@@ -60,7 +61,8 @@ class WatchedTable:
         self._header: list[str] = []
         self._rows: list[Array] = []  # of the frame that is not complete
         self._last_growth = time.monotonic()
-        self.n_bad_rows = 0
+        self._n_bad = 0
+        self.problems: list[str] = []
 
     def take(self) -> list[View]:
         """Views that are complete."""
@@ -73,7 +75,7 @@ class WatchedTable:
         for line in lines:
             row = self._row(line)
             if row is None:
-                self.n_bad_rows += 1
+                self._refuse(line)
                 continue
             if self._rows and row[0] != self._rows[0][0]:
                 views.append(self._view())
@@ -81,6 +83,13 @@ class WatchedTable:
         if self._rows and time.monotonic() - self._last_growth > _SETTLE_S:
             views.append(self._view())
         return views
+
+    def _refuse(self, line: str) -> None:
+        """A row that is none is told: the first, the tenth, the hundredth ..."""
+        self._n_bad += 1
+        if str(self._n_bad).strip("0") == "1":
+            text = f"{self._tail.path}: {shown(line)} is no row of {','.join(self._header)}"
+            self.problems.append(text + (f" ({self._n_bad} in all)" if self._n_bad > 1 else ""))
 
     @property
     def is_empty(self) -> bool:
@@ -188,6 +197,11 @@ class WatchedFolder:
     def is_over(self) -> bool:
         """Whether the folder is done and all of it taken."""
         return self._is_over
+
+    def problems(self) -> list[str]:
+        """Rows that are none."""
+        told, self._table.problems = self._table.problems, []
+        return told
 
     def take(self) -> list[View]:
         """New views: of the table where there is one, else of the images."""
