@@ -24,6 +24,8 @@ _TOUCHED = 0.005  # probability that a cluster at rest is touched between two me
 _CALMED = 0.03  # that one that sways has come to rest
 _SURE = 3.0  # log odds at which the motion is switched
 _MOST = 8.0  # log-likelihood ratio that one measurement may have: gates let wrong ones through
+_LEAN_S = 5.0  # over which the mean displacement at rest is taken
+_LEANING = 4.0  # times the trembling
 _UNSEEN_M = 0.002  # a cluster that is not looked at may have been moved so far, one sigma ...
 _UNSEEN_S = 5.0  # ... after so long
 _PUSHED_NIS = 25.0  # of three degrees of freedom: something pushed it again
@@ -58,6 +60,7 @@ class ClusterTrack:
         self.trembling: tuple[Array, Array] | None = None  # at rest: displacement and covariance when last seen
         self.last_nis = float("nan")
         self.last_shape = -np.inf
+        self.lean, self.lean_s = np.zeros(3), 0.0  # mean displacement while at rest, and over how long
 
     @property
     def is_moving(self) -> bool:
@@ -182,6 +185,27 @@ class ClusterTrack:
         P[:3, :3] += 1e-6 * np.eye(3)
         P[3:6, 3:6] += 0.15**2 * np.eye(3)
         f.reset(f.x, P)
+
+    def rest(self, u: Array, dt: float, stamp: float) -> None:
+        """At rest it was seen displaced by u (3,): one that leans away for long, and not by trembling, is growing."""
+        weight = min(dt, _LONG_S) / _LEAN_S
+        self.lean, self.lean_s = self.lean + weight * (u - self.lean), self.lean_s + dt
+        distance = float(np.linalg.norm(self.lean))
+        f = self.filter
+        if (
+            f is None
+            or self.anchor is None
+            or self.lean_s < 2.0 * _LEAN_S
+            or distance < _LEANING * self.config.tremble_m
+        ):
+            return
+        x, P = state_at_rest(self.anchor + self.lean, self.config)
+        x[3:6] = self.lean / self.lean_s
+        x[6:], P[6, 6], P[7, 7] = f.x[6:], f.P[6, 6], f.P[7, 7]
+        P[3:6, 3:6] = (distance / self.lean_s) ** 2 * np.eye(3)
+        f.reset(x, P)
+        self.stamp, self.lean_s = stamp, 0.0
+        self._switch(MotionKind.GROWTH, f"for long it has stood {1e3 * distance:.1f} mm from where it was")
 
     def wants_filter(self, stamp: float) -> bool:
         """Whether its filter should take this measurement: it moves, or has rested for a while."""

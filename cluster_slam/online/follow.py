@@ -44,6 +44,7 @@ def follow(world: World, seen: Seen, w: Array, S: Array, stamp: float) -> None:
             cluster.update(at.anchor[slot] + u[k], pose.shift_cov[k], shape, stamp)
         if not cluster.is_moving:
             cluster.trembling = rest_d[k], rest_P[k]
+            cluster.rest(u[k], stamp - cluster.last, stamp)
         cluster.last = stamp
         cluster.n += int(n_seen[slot])
 

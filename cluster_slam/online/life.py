@@ -20,6 +20,8 @@ _VIEW = -0.02  # at the rim of the view nothing is a miss
 _MANY = 2.0  # times as many new points as false ones are usual: then they are flowers, at once
 _GHOST_LOOKS = 15  # looks at a landmark before it can be found to be none ...
 _GHOST_SHARE = 0.3  # ... seen in so small a share of them, compared with the others
+_WILD_CHI2 = 150.0  # 3 degrees of freedom: errors of up to five times what is stated ...
+_WILD_SHARE = 0.6  # ... and within this share of how close flowers stand
 _FLOWER_SHARE = 0.3  # radius of a flower over how close they stand
 
 
@@ -28,6 +30,7 @@ def live(world: World, seen: Seen, view: View, T: Array, w: Array) -> tuple[IntA
     table = world.flowers
     row_of = np.full(len(w), -1, dtype=np.int64)
     row_of[seen.cols] = seen.rows
+    claim_wild(world, seen, view, w, row_of)
     match_tentative(world, seen, view, T, w, row_of)
     count_hits(world, row_of[row_of >= 0], view.stamp)
     count_misses(world, seen.at, T, view.c, row_of[row_of >= 0])
@@ -41,6 +44,31 @@ def live(world: World, seen: Seen, view: View, T: Array, w: Array) -> tuple[IntA
     reasons[young & ~shown] = int(RejectReason.UNCONFIRMED)
     confirm(world, view.stamp)
     return np.where(shown, table.ids[row_of] if len(table) else -1, -1), reasons
+
+
+def claim_wild(world: World, seen: Seen, view: View, w: Array, row_of: IntArray) -> None:
+    """A point outside of all gates, next to a flower that was not seen, is that flower with a wild error.
+
+    No other flower can stand so near. The point tells whose it is and nothing else: no state takes it in.
+    """
+    table = world.flowers
+    left, rows = np.flatnonzero(row_of < 0), np.flatnonzero(table.confirmed)
+    if not (len(left) and len(rows) and np.isfinite(world.spacing)):
+        return
+    expected = world.expected(rows, seen.at)
+    gap = w[left][:, None] - expected[None]
+    nearest = np.einsum("abi,abi->ab", gap, gap).argmin(1)
+    gap = gap[np.arange(len(left)), nearest]
+    slot = table.slot[rows[nearest]]
+    cov = view.S[left] + table.cov[rows[nearest]] + seen.at.P[slot] + world.config.slack_m**2 * np.eye(3)
+    chi2 = np.einsum("ai,aij,aj->a", gap, information(cov), gap)
+    free = np.ones(len(table), dtype=bool)
+    free[seen.rows] = False
+    near = np.sqrt((gap * gap).sum(1)) < _WILD_SHARE * world.spacing
+    for k in np.argsort(chi2, kind="stable").tolist():
+        row = int(rows[nearest[k]])
+        if near[k] and chi2[k] < _WILD_CHI2 and free[row]:
+            row_of[left[k]], free[row] = row, False
 
 
 def match_tentative(world: World, seen: Seen, view: View, T: Array, w: Array, row_of: IntArray) -> None:

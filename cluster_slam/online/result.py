@@ -41,7 +41,9 @@ def make_result(session: Session, tracker: OnlineTracker, told: Told, timings: d
             covs=told.drift["cov"].astype(np.float64),
         ),
         calibration=_calibration(tracker),
-        diagnostics=Diagnostics(nis=nis, reasons=reasons, estimated_noise={}),
+        diagnostics=Diagnostics(
+            nis=nis, reasons=reasons, estimated_noise={"flower_factor": float(np.sqrt(tracker.noise_watch.factor))}
+        ),
         command="track",
         config=asdict(tracker.config),
         timings_s=timings,
@@ -99,6 +101,10 @@ def _rows_of(labels: IntArray, ids: IntArray, tracker: OnlineTracker) -> IntArra
     row = {int(i): k for k, i in enumerate(ids.tolist())}
     number = np.array([row.get(i, -1) for i in final], dtype=np.int64)
     return number[np.searchsorted(known, labels)] if len(known) else np.zeros(0, dtype=np.int64)
+
+
+def _noise(tracker: OnlineTracker) -> dict[str, float]:
+    return {"flower_factor": float(np.sqrt(tracker.noise_watch.factor))}
 
 
 def _calibration(tracker: OnlineTracker) -> Calibration | None:

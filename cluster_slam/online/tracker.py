@@ -16,11 +16,14 @@ from cluster_slam.online.intake import Intake
 from cluster_slam.online.life import forget, live
 from cluster_slam.online.records import Tracks, Update
 from cluster_slam.online.upkeep import merge_doubles, regroup, solve_all, solve_near, tell_lost
+from cluster_slam.online.watch import MountWatch, NoiseWatch
 from cluster_slam.online.world import World
 from cluster_slam.records import Calibration, Frame, IntArray, PoseError, RejectReason, StatedNoise
 from tracking.ukf import prepare
 
 _LEAST_M = 1e-5  # no point is known better: numbers must stay numbers
+_KNOWN = 5  # observations of a flower whose innovations say something of the noise
+_FIXED = 4  # flowers that fix a pose
 _ALL_S = 5.0  # the whole map is solved this often, once the hand-eye transform is frozen
 
 
@@ -62,6 +65,7 @@ class OnlineTracker:
         self.world = World(self.config, information, seed)
         self.cov_given = self._in_camera(_diagonal(n.pose_rotation, n.pose_translation))
         self.intake = Intake()
+        self.noise_watch, self.mount_watch = NoiseWatch(), MountWatch(self.cov_given)
         self.first_stamp = self.last_stamp = self.last_solve = self.last_all = self.last_group = -np.inf
         self.T = np.eye(4) if self.X0 is None else self.X0
         self.pose_cov = np.eye(6)
@@ -86,8 +90,18 @@ class OnlineTracker:
         labels, reasons = live(self.world, seen, view, T, w)
         self.T, self.pose_cov, self.last_given = T, seen.pose.cov, frame.pose
         self.n_frames += 1
+        warnings = (*taken.warnings, *self._watch(seen, taken.stamp))
         self._tidy(taken.stamp)
-        return self._update(frame, taken.warnings, use, labels, reasons, seen)
+        return self._update(frame, warnings, use, labels, reasons, seen)
+
+    def _watch(self, seen: Seen, stamp: float) -> tuple[str, ...]:
+        """Learn from the residuals how large errors are, and whether the camera has moved on its mount."""
+        self.noise_watch.see(seen.chi2[self.world.flowers.n[seen.rows] >= _KNOWN])
+        is_frozen = self.X0 is not None and self.world.map.is_frozen and self.pose_error == "absolute"
+        if not (is_frozen and len(seen.rows) >= _FIXED):
+            return ()
+        warning = self.mount_watch.see(stamp, seen.pose.z)
+        return (warning,) if warning else ()
 
     def _note_time(self, stamp: float) -> float:
         """Seconds since the last frame."""
@@ -105,7 +119,7 @@ class OnlineTracker:
         """The frame's usable points, with the camera's pose as it is known before they speak."""
         T, cov = self._predicted_pose(frame, dt)
         stated = 0.5 * (frame.covs[use] + np.swapaxes(frame.covs[use], 1, 2))
-        S = rotate_cov(T[:3, :3], stated) + _LEAST_M**2 * np.eye(3)
+        S = rotate_cov(T[:3, :3], self.noise_watch.factor * stated) + _LEAST_M**2 * np.eye(3)
         return View(T, cov, frame.points[use], S, stamp, self.n_frames)
 
     def _predicted_pose(self, frame: Frame, dt: float) -> tuple[Array, Array]:
