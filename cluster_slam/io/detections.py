@@ -10,9 +10,11 @@ from cluster_slam.geometry import Array
 from cluster_slam.io.camera_info import read_camera
 from cluster_slam.io.frames import frames_of
 from cluster_slam.io.tables import Table, check_lengths, read_table
-from cluster_slam.lift import Convention, lift
+from cluster_slam.lift import Convention, lift, lift_unscented
 from cluster_slam.records import Observations, StatedNoise
 from cluster_slam.sensors.camera import Camera
+
+SIGMAS = ("sigma_pixel", "sigma_depth")  # optional columns, as the command detect writes them: px, m
 
 
 def read_detections(
@@ -37,7 +39,10 @@ def read_detections(
         Names file, row, value and what was expected.
     """
     table = read_table(
-        folder / "detections.csv", ("timestamp", "u", "v", "depth"), ("score",), ignored=("width", "height")
+        folder / "detections.csv",
+        ("timestamp", "u", "v", "depth"),
+        ("score", *SIGMAS),
+        ignored=("width", "height"),
     )
     check_lengths(table, ("u", "v", "depth"))
     camera = read_camera(folder / "camera.yaml")
@@ -50,6 +55,8 @@ def read_detections(
     points, covs = lift(
         camera, pixels, depths, convention=convention, sigma_px=noise.pixel, depth_coefficient=noise.depth
     )
+    if all(name in table.columns for name in SIGMAS):
+        points, covs = _with_own_sigmas(camera, table, convention, noise)
     lost = np.isnan(points).any(axis=1)
     if lost.any():
         k = int(lost.argmax())
@@ -58,6 +65,24 @@ def read_detections(
     scores = table.columns.get("score", np.full(len(table), np.nan))
     warnings = (*table.warnings, *_outside(table, camera))
     return Observations(frame, points, covs, scores, True), warnings
+
+
+def _with_own_sigmas(camera: Camera, table: Table, convention: Convention, noise: StatedNoise) -> tuple[Array, Array]:
+    """Points and covariances where the detector said how well it knows each pixel and depth.
+
+    Raises
+    ------
+    InputError
+        A sigma is not above 0.
+    """
+    depths, pixels = table.columns["depth"], table.stack(("u", "v"))
+    stated = (np.full(len(table), noise.pixel), noise.depth * depths**2)
+    given = [np.where(np.isnan(table.columns[n]), s, table.columns[n]) for n, s in zip(SIGMAS, stated, strict=True)]
+    for name, values in zip(SIGMAS, given, strict=True):
+        if not (values > 0).all():
+            k = int((~(values > 0)).argmax())
+            raise table.refuse(k, f"{name} is {values[k]:g}, expected a number above 0")
+    return lift_unscented(camera, pixels, depths, convention=convention, sigma_px=given[0], sigma_depth=given[1])
 
 
 def _outside(table: Table, camera: Camera) -> tuple[str, ...]:

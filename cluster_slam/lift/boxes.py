@@ -90,9 +90,8 @@ def lift_boxes(
 def _reaching(table: Array, k: int) -> Array:
     """The boxes (m, 4) that touch box k."""
     away = np.abs(table[:, :2] - table[k, :2])
-    touches = (away < (table[:, 2:] + table[k, 2:]) / 2 + table[k, 2:] / 2).all(1)
-    touches[k] = False
-    return table[touches]
+    touches: BoolArray = (away < (table[:, 2:] + table[k, 2:]) / 2 + table[k, 2:] / 2).all(1)
+    return table[touches & (np.arange(len(table)) != k)]
 
 
 def _are_alike(widths: Array) -> BoolArray:
