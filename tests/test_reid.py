@@ -86,8 +86,8 @@ def test_probabilities_are_close_to_enumeration(seed: int) -> None:
     pairs, new, _ = association_probabilities(log_ratio)
     np.testing.assert_allclose(pairs.sum(axis=1) + new, 1.0, atol=1e-9)
     difference = np.abs(pairs - exact(np.exp(log_ratio)))
-    assert difference.max() < 0.15  # loops of three that compete at even odds
-    assert difference.mean() < 0.05
+    assert difference.max() < 0.3  # loops of three that compete at even odds
+    assert difference.mean() < 0.1
 
 
 def test_what_is_not_admissible_has_no_probability() -> None:

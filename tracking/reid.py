@@ -18,6 +18,7 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 N_SEEDS = 24  # beginnings: the smallest offsets that put one member on another
 N_ROUNDS = 3  # of assigning and moving
+NEGLIGIBLE = -12.0  # log likelihood ratios below this tie nothing together
 _BLOCK = 2_000_000  # entries of the largest array
 
 
@@ -175,6 +176,15 @@ def association_probabilities(log_ratio: Array, n_rounds: int = 50) -> tuple[Arr
     pairs (r, c), new (r,), gone (c,)
         Rows of ``pairs`` and ``new`` sum to one.
     """
+    pairs = np.zeros(log_ratio.shape)
+    for rows, cols in _components(log_ratio > NEGLIGIBLE):
+        block = np.ix_(rows, cols)
+        pairs[block] = _propagate(log_ratio[block], n_rounds)
+    return pairs, np.maximum(1.0 - pairs.sum(axis=1), 0.0), np.maximum(1.0 - pairs.sum(axis=0), 0.0)
+
+
+def _propagate(log_ratio: Array, n_rounds: int) -> Array:
+    """Marginals (r, c) of the pairs of one connected component."""
     ratio = np.exp(np.clip(log_ratio, -25.0, 25.0)) * np.isfinite(log_ratio)
     back = np.ones_like(ratio)  # from column to row
     for _ in range(n_rounds):
@@ -182,6 +192,19 @@ def association_probabilities(log_ratio: Array, n_rounds: int = 50) -> tuple[Arr
         forth = ratio / (1.0 + np.maximum(weighted.sum(axis=1, keepdims=True) - weighted, 0.0))
         back = 1.0 / (1.0 + np.maximum(forth.sum(axis=0) - forth, 0.0))
     weighted = ratio * back
-    total = 1.0 + weighted.sum(axis=1)
-    pairs: Array = weighted / total[:, None]
-    return pairs, 1.0 / total, np.maximum(1.0 - pairs.sum(axis=0), 0.0)
+    pairs: Array = weighted / (1.0 + weighted.sum(axis=1))[:, None]
+    return pairs
+
+
+def _components(admissible: BoolArray) -> list[tuple[IntArray, IntArray]]:
+    """Rows and columns that pairs (r, c) tie together, one entry a component."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    r, c = admissible.shape
+    i, j = np.nonzero(admissible)
+    graph = coo_array((np.ones(len(i), dtype=np.int8), (i, j + r)), shape=(r + c, r + c))
+    n, label = connected_components(graph, directed=False)
+    order = np.argsort(label, kind="stable").astype(np.int64)
+    parts = np.split(order, np.cumsum(np.bincount(label, minlength=n))[:-1])
+    return [(p[p < r], p[p >= r] - r) for p in parts if (p < r).any() and (p >= r).any()]

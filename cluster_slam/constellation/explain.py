@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from cluster_slam.config import MatchConfig
 from cluster_slam.constellation.fit import Pairs, fit
@@ -17,7 +18,6 @@ from tracking.reid import Background, Groups, GroupScores, same_group
 
 REACH_SIGMAS = 3.5  # centres farther apart are not compared
 JUMP_M = 0.006  # a centroid's jump when flowers are lost or unseen, one sigma an axis
-MAX_PAIRS = 60_000  # unit pairs that are scored at once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,12 +53,14 @@ def explain(scene: Scene, poses: Similarities) -> list[Explained]:
     """Explanations by each pose of a stack."""
     moved = poses.apply(scene.query.centres)
     reach = REACH_SIGMAS * np.sqrt(1.6**2 * scene.known.var_offset + JUMP_M**2)
-    near = np.linalg.norm(moved[:, :, None] - scene.known.centres, axis=3) < reach
-    pose, q, u = np.nonzero(near)
+    tree = cKDTree(scene.known.centres)
     out: list[Explained] = []
-    for first in range(len(poses)):
-        rows = np.flatnonzero(pose == first)
-        out.append(_explain(scene, poses.take(np.array([first])), q[rows], u[rows]))
+    for k, centres in enumerate(moved):
+        near = cKDTree(centres).query_ball_tree(tree, float(reach.max()))
+        q = np.repeat(np.arange(len(near)), [len(n) for n in near])
+        u = np.array([i for n in near for i in n], dtype=np.int64)
+        close = np.linalg.norm(centres[q] - scene.known.centres[u], axis=1) < reach[u]
+        out.append(_explain(scene, poses.take(np.array([k])), q[close], u[close]))
     return out
 
 

@@ -20,6 +20,8 @@ from cluster_slam.records import Constellation, PlantMap
 
 SINGLES_UP_TO = 80  # flowers on each side that are also matched one by one
 N_REFINED = 6
+GLANCE_SEEDS, GLANCE_POSES = 10, 300  # of a glance
+LOOKS = 4000  # clusters that are looked at closely, over all poses: large plants need fewer poses to tell
 REPEATED_SHARE = 0.7  # of the centres: a second pose that puts so many on others means a repeated structure
 
 
@@ -97,6 +99,21 @@ def match(
     return Match(name, best.found.log_ratio, best.evidence, runner_up, repeated, found)
 
 
+def glance(session: Constellation, plant: PlantMap, config: MatchConfig, *, similarity: bool = False) -> float:
+    """How well the centres alone agree under a few guessed poses: a score to rank many plants by, quickly."""
+    alive = _alive(plant)
+    best = 0.0
+    for space, single in _ways(session, alive):
+        scene = _scene(session, alive, space, config, GrowthConfig(), single=single, similarity=similarity)
+        if scene is None:
+            continue
+        query, known = _places(scene.query, 0.002), _places(scene.known, 0.006)
+        poses = guess_poses(query, known, scene.scale_range, GLANCE_SEEDS, GLANCE_POSES)
+        if len(poses):
+            best = max(best, float(quick_scores(poses, query, known, scene.background.log_group_density)[0].max()))
+    return best
+
+
 def _alive(plant: PlantMap) -> PlantMap:
     """Only the flowers that may still be there."""
     keep = plant.flower_presence > 0.02
@@ -161,12 +178,13 @@ def _search(scene: Scene) -> tuple[list[Explained], bool]:
         return [], False
     scores, counts = quick_scores(poses, query, known, scene.background.log_group_density)
     spread = float(np.sqrt(((query.centres - query.centres.mean(0)) ** 2).sum(1).mean()))
-    top = best_distinct(poses, scores, query.centres, 0.05 * spread, config.n_kept)
+    n_kept = int(np.clip(LOOKS / max(len(scene.query), 1), 6, config.n_kept))
+    top = best_distinct(poses, scores, query.centres, 0.05 * spread, n_kept)
     n_least = min(len(query.centres), len(known.centres))
     far = best_distinct(poses.take(top), scores[top], query.centres, 0.3 * spread, 2)
     repeated = len(far) > 1 and bool((counts[top[far]] >= max(4, REPEATED_SHARE * n_least)).all())
     found = sorted(explain(scene, poses.take(top)), key=lambda e: -e.log_ratio)
-    refined = [refine(scene, e) for e in found[:N_REFINED]]
+    refined = [refine(scene, e) for e in found[: min(N_REFINED, n_kept // 3)]]
     return sorted(refined, key=lambda e: -e.log_ratio), repeated
 
 

@@ -10,12 +10,13 @@ import numpy as np
 
 from cluster_slam.config import MapConfig
 from cluster_slam.constellation.growth import at
-from cluster_slam.constellation.match import Match, match
+from cluster_slam.constellation.match import Match, glance, match
 from cluster_slam.geometry import Array
 from cluster_slam.records import Constellation, PlantMap
 
 FAMILIAR = 2.0  # log odds of a plant that the map has, before looking: most sessions show one
 REPEATED = 0.5  # a rival that explains more than this share of the best evidence is a clone, or a repeated structure
+N_CLOSE = 6  # plants that are matched in full where the map has many
 
 
 class Refusal(StrEnum):
@@ -52,17 +53,38 @@ def decide(
     progress: Callable[[str, float], None] | None = None,
 ) -> Decision:
     """Match a session with plants as the map holds them, and decide."""
+    say = progress or (lambda _stage, _fraction: None)
+    moved = [at(plant, session.start, config.growth) for plant in plants]
+    closely = _worth_a_look(session, moved, config, similarity, say)
     matches = []
-    for k, plant in enumerate(plants):
-        if progress is not None:
-            progress(f"aligning with {plant.name}", k / len(plants))
-        moved = at(plant, session.start, config.growth)
-        matches.append(match(session, moved, config.match, config.growth, similarity=similarity))
+    for k, plant in enumerate(moved):
+        if k in closely:
+            say(f"aligning with {plant.name}", 0.5 + 0.5 * k / len(moved))
+            matches.append(match(session, plant, config.match, config.growth, similarity=similarity))
+        else:
+            matches.append(Match(plant.name, 0.0, -np.inf, -np.inf, False))
     matches.sort(key=lambda m: -m.evidence)
     probabilities = _probabilities(matches)
     refusal, reason = _refusal(session, plants, matches, config)
     accepted = matches[0] if refusal is Refusal.NONE and matches else None
     return Decision(matches, probabilities, accepted, refusal, reason)
+
+
+def _worth_a_look(
+    session: Constellation,
+    plants: Sequence[PlantMap],
+    config: MapConfig,
+    similarity: bool,
+    say: Callable[[str, float], None],
+) -> set[int]:
+    """The plants that are matched in full: all of a few, the best at a glance of many."""
+    if len(plants) <= 2 * N_CLOSE:
+        return set(range(len(plants)))
+    scores = []
+    for k, plant in enumerate(plants):
+        say(f"glancing at {plant.name}", 0.5 * k / len(plants))
+        scores.append(glance(session, plant, config.match, similarity=similarity))
+    return set(np.argsort(-np.array(scores), kind="stable")[:N_CLOSE].tolist())
 
 
 def _probabilities(matches: list[Match]) -> Array:
