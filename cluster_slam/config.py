@@ -56,7 +56,11 @@ class TemplateConfig:
 class ParticleConfig:
     """Options of the association where poses drift."""
 
-    n_starts: int = 1  # growths of the map in each direction of time; the likeliest is kept
+    calibrate: bool = True  # clocks that differ and depths taken for ranges are found and corrected first
+    gap_steps: float = 25.0  # usual steps without a point after which a map of its own begins ...
+    fewest_points: int = 30  # ... if so many points are seen before the next one
+    n_motions: int = 8  # that are tried in a gap, beside what odometry says
+    submap_slack: float = 2.0  # sigmas of places are taken times this when maps are compared: they are bent, too
     n_particles: int = 60  # for a stretch; twice as many after a gap
     n_tries: int = 3  # of a stretch after a gap; the best is kept
     stretch_points: int = 100  # points that are associated before all is smoothed again

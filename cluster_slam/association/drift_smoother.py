@@ -35,10 +35,10 @@ class Steps:
     dof: Array
     length: Array  # (s,) how many usual steps each spans, at least 1
 
-    def until(self, n_frames: int) -> Steps:
-        """The steps between the first n frames."""
-        s = max(n_frames - 1, 0)
-        return Steps(self.motion[:s], self.basis, self.cov[:s], self.dof[:s], self.length[:s])
+    def between(self, first: int, end: int) -> Steps:
+        """The steps between the frames ``first`` to ``end`` (without it)."""
+        s = slice(first, max(end - 1, first))
+        return Steps(self.motion[s], self.basis, self.cov[s], self.dof[s], self.length[s])
 
 
 def steps_of(given: Array, cov_step: Array, stamps: Array, config: ParticleConfig) -> Steps:

@@ -10,16 +10,17 @@ backwards in time, since one beginning may be easier than the other, and the lik
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from cluster_slam.association.calibration import calibrate, delayed
 from cluster_slam.association.drift_smoother import DriftSmoother, Steps, steps_of
 from cluster_slam.association.frames import Frames
 from cluster_slam.association.particles import trace_stretch
+from cluster_slam.association.submaps import Part, joined, matched, motions, spans_between_gaps, window
 from cluster_slam.config import ParticleConfig
-from cluster_slam.geometry import Array, adjoint, inverse, transform
+from cluster_slam.geometry import Array, inverse, transform
 from cluster_slam.records import IntArray
 
 _GAP = 5.0  # usual steps; what is longer is a gap, in which nothing was seen
@@ -68,18 +69,10 @@ def trace_drifting(
     config : options.
     rng : for the particles.
     """
-    forward = _Tracer(frames, given, steps_of(given, cov_step, frames.stamps, config), config, rng)
-    A = adjoint(inverse(given[:-1]) @ given[1:])
-    turned = frames.reversed()
-    cov_back = (A @ cov_step @ np.swapaxes(A, 1, 2))[::-1]
-    backward = _Tracer(turned, given[::-1], steps_of(given[::-1], cov_back, turned.stamps, config), config, rng)
-    starts = [tracer.price(tracer.grow()) for _ in range(config.n_starts) for tracer in (forward, backward)]
-    likeliest = min(range(len(starts)), key=lambda k: starts[k].cost)
-    if likeliest % 2 == 0:
-        best = forward.redo(starts[likeliest])
-    else:
-        best = _played_back(backward.redo(starts[likeliest]), turned)
-    best = _anchored(best, given[0])
+    calibration = calibrate(frames, given, config)
+    seen, late = calibration.correct(frames), delayed(given, frames.stamps, calibration.lag_s)
+    tracer = _Tracer(seen, late, steps_of(late, cov_step, frames.stamps, config), config, rng)
+    best = _anchored(tracer.redo(tracer.price(tracer.assemble())), given[0])
     steps = steps_of(given, cov_step, frames.stamps, config)
     weights = DriftSmoother(frames, steps, config.point_dof).step_weights(best.T)
     scaled = cov_step * (config.odometry_scale**2 / weights)[:, None, None]
@@ -96,13 +89,6 @@ class _State:
     cost: float
 
 
-def _played_back(state: _State, turned: Frames) -> _State:
-    """The outcome of the session played backwards, in the order of time."""
-    label = np.empty_like(state.label)
-    label[turned.order] = state.label
-    return _State(state.T[::-1], label, state.places, state.cost)
-
-
 def _anchored(state: _State, first: Array) -> _State:
     """The same with the first pose (4, 4) where it defines the world."""
     home = first @ inverse(state.T[0])
@@ -116,6 +102,55 @@ class _Tracer:
         self, frames: Frames, given: Array, steps: Steps, config: ParticleConfig, rng: np.random.Generator
     ) -> None:
         self.frames, self.given, self.steps, self.config, self.rng = frames, given, steps, config, rng
+
+    def assemble(self) -> _State:
+        """Map what lies between gaps for itself, then join the parts: the largest, then what joins most clearly."""
+        spans = spans_between_gaps(self.steps, self.frames.n_frames, self.config.gap_steps)
+        parts = [self._part(*span) for span in spans]
+        low = high = int(np.argmax([part.weight for part in parts]))
+        whole = parts[low]
+        if whole.weight == 0:
+            return self.grow()
+        while low > 0 or high + 1 < len(parts):
+            sides = [k for k in (low - 1, high + 1) if 0 <= k < len(parts)]
+            ranked = [self._join(whole, parts[k]) for k in sides]
+            clearest = int(np.argmax([margin for _, margin in ranked]))
+            whole = ranked[clearest][0]
+            low, high = min(low, sides[clearest]), max(high, sides[clearest])
+        return _State(whole.T, whole.label, whole.places, 0.0)
+
+    def _window(self, first: int, end: int) -> _Tracer:
+        """The same for a part of the session."""
+        frames, steps = window(self.frames, first, end), self.steps.between(first, end)
+        return _Tracer(frames, self.given[first:end], steps, self.config, self.rng)
+
+    def _part(self, first: int, end: int) -> Part:
+        """What was seen between two gaps; where that is little, it waits for a map of its surroundings."""
+        tracer = self._window(first, end)
+        n = len(tracer.frames)
+        if n < self.config.fewest_points:
+            return tracer.as_part(_State(self.given[first:end], np.full(n, -1), np.empty((0, 3)), 0.0), first)
+        return tracer.as_part(tracer.grow(), first)
+
+    def as_part(self, state: _State, first: int) -> Part:
+        """A state as a part of a session, whose first frame it is."""
+        var = self._covs(state)[:, 0, 0] * self.config.submap_slack**2
+        return Part(first, first + len(state.T), state.T, state.label, state.places, var, self.frames.frame)
+
+    def _join(self, a: Part, b: Part) -> tuple[Part, float]:
+        """Both parts as one, and by how much the second best way to join them is worse."""
+        if len(b.places) == 0:
+            return joined(a, b, np.zeros(self.steps.basis.shape[1]), self.steps), np.inf
+        tracer = self._window(min(a.first, b.first), max(a.end, b.end))
+        price = self.config.growing_cost
+        tries = []
+        for z in motions(a, b, self.steps, self.config.n_motions):
+            trial = matched(joined(a, b, z, self.steps), len(a.places))
+            tries.append(tracer.settle(trial.T, trial.label, trial.places, price, 1))
+        tries.sort(key=lambda state: state.cost)
+        best = tracer.merge(tries[0], price)
+        others = [t.cost for t in tries[1:] if (t.label != tries[0].label).mean() > 0.02]
+        return tracer.as_part(best, min(a.first, b.first)), min(others, default=np.inf) - tries[0].cost
 
     def grow(self) -> _State:
         """Go through the session, stretch by stretch."""
@@ -154,12 +189,12 @@ class _Tracer:
         T = np.concatenate([state.T, found.T[: end - done]])
         label = np.concatenate([state.label, found.label[:n_points]])
         price = self.config.growing_cost
-        return self._merge(self._settle(T, label, found.places, price), price)
+        return self.merge(self.settle(T, label, found.places, price), price)
 
     def price(self, state: _State) -> _State:
         """The same with the final price of landmarks, which merges more of them."""
         price = self.config.landmark_cost
-        return self._merge(self._settle(state.T, state.label, state.places, price), price, 40)
+        return self.merge(self.settle(state.T, state.label, state.places, price), price, 40)
 
     def redo(self, state: _State) -> _State:
         """Associate every stretch again, with the landmarks that the others support, where that helps."""
@@ -169,15 +204,11 @@ class _Tracer:
         return state
 
     def _spans(self) -> list[tuple[int, int]]:
-        """Frames from gap to gap (cut where they are many), and every two neighbours together."""
-        n = self.frames.n_frames
-        cuts = [0, *(np.flatnonzero(self.steps.length > _GAP) + 1).tolist(), n]
-        bounds = [0]
-        for a, b in pairwise(cuts):
-            bounds += np.linspace(a, b, max(1, round((b - a) / 120)) + 1).astype(int)[1:].tolist()
-        single = list(pairwise(bounds))
-        double = list(zip(bounds[:-2], bounds[2:], strict=True))
-        return sorted(single + double)
+        """Frames with ``stretch_points`` points each, every two neighbours overlapping by half."""
+        m, half = len(self.frames), self.config.stretch_points // 2
+        bounds = [*self.frames.frame[0 : max(m - half, 1) : half].tolist(), self.frames.n_frames]
+        bounds = sorted({0, *bounds})
+        return list(zip(bounds[:-2], bounds[2:], strict=True)) or [(0, self.frames.n_frames)]
 
     def _redo_span(self, state: _State, span: tuple[int, int], price: float) -> _State:
         a, b = span
@@ -201,8 +232,8 @@ class _Tracer:
         label[here] = found.label
         T = state.T.copy()
         T[a:b] = found.T
-        new = self._settle(T, label, found.places, price, 2)
-        return self._merge(new, price, 4) if new.cost < state.cost - 1e-6 else state
+        new = self.settle(T, label, found.places, price, 2)
+        return self.merge(new, price, 4) if new.cost < state.cost - 1e-6 else state
 
     def _covs(self, state: _State) -> Array:
         """How well places are known (l, 3, 3) relative to the latest pose: noise that repeats, and that does not."""
@@ -211,7 +242,7 @@ class _Tracer:
         var = noise_sq * (0.06 + 2.5 / np.maximum(count, 1))
         return np.asarray(var[:, None, None] * np.eye(3))
 
-    def _settle(self, T: Array, label: IntArray, places: Array, price: float, n_rounds: int = 3) -> _State:
+    def settle(self, T: Array, label: IntArray, places: Array, price: float, n_rounds: int = 3) -> _State:
         """Smooth, associate again, until nothing changes."""
         smoother = self._smoother(len(T))
         places, label = _compact(places, label)
@@ -230,7 +261,7 @@ class _Tracer:
         f = self.frames
         k = int(f.starts[n])
         part = Frames(f.order[:k], f.starts[: n + 1], f.frame[:k], f.points[:k], f.covs[:k], f.stamps[:n])
-        return DriftSmoother(part, self.steps.until(n), self.config.point_dof)
+        return DriftSmoother(part, self.steps.between(0, n), self.config.point_dof)
 
     def _associate(self, smoother: DriftSmoother, T: Array, places: Array) -> IntArray:
         """Landmark of each point (m,), one to one in every frame; -1 where none fits."""
@@ -247,7 +278,7 @@ class _Tracer:
             label[here] = np.where(column < len(places), column, -1)
         return np.asarray(label)
 
-    def _merge(self, state: _State, price: float, n_tries: int = 12) -> _State:
+    def merge(self, state: _State, price: float, n_tries: int = 12) -> _State:
         """Try close landmarks that are hardly ever seen together as one; keep what makes the whole likelier."""
         failed: set[tuple[float, ...]] = set()
         while n_tries > 0:
@@ -258,7 +289,7 @@ class _Tracer:
                     continue
                 n_tries -= 1
                 label = np.where(state.label == a, b, state.label)
-                trial = self._settle(state.T, label, state.places, price, 2)
+                trial = self.settle(state.T, label, state.places, price, 2)
                 if trial.cost < state.cost:
                     merged = trial
                     break

@@ -1,0 +1,179 @@
+"""What a session shows of its instruments before anything is associated: a clock that is late, depth taken for range.
+
+Points of successive frames that lie close together, odometry taken out, are pieces of one landmark's history. Within
+a piece the landmark stands still, so whatever makes it move depends on the instruments. Two such errors are common,
+grow with no landmark's help into metres, and are told apart by their direction:
+
+- odometry is ahead of the camera, or behind, by a constant time: points move across the ray as the vehicle turns;
+- a depth was taken for a range (or the reverse): points move along the ray as they wander from the axis, by
+  a power of the cosine of the angle between them.
+
+Each is estimated by its own absolute errors (least absolute deviations, as pieces are not pure), and believed only
+where the data insist on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment, minimize_scalar
+
+from cluster_slam.association.frames import Frames
+from cluster_slam.config import ParticleConfig
+from cluster_slam.geometry import Array, inverse, se3_exp, se3_log, transform
+from cluster_slam.records import IntArray
+
+_GATE = 9.0  # chi-square of a step from point to point, three degrees of freedom
+_PATIENCE = 5.0  # usual steps for which a piece waits for its next point
+_SPAN = 20.0  # usual steps between the points that are compared
+_LAG_STEPS = 3.0  # usual steps by which clocks may differ
+_MAX_POWER = 2.0  # of the cosine
+_LEAST_GAIN = 10.0  # log-likelihood that a correction must bring
+_FEWEST_PAIRS, _MOST_PAIRS = 100, 20_000
+_SLOW = 2.0  # errors that repeat within a piece are so much larger than those that do not
+_N_ROUNDS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Errors of the instruments: ``lag_s`` by which odometry is ahead, ``power`` of the cosine in ranges.
+
+    A point at distance r and angle a off the axis was given at r cos(a)**power. ``along`` is the factor on the stated
+    sigma along the ray that the corrected points ask for, at most one.
+    """
+
+    lag_s: float = 0.0
+    power: float = 0.0
+    along: float = 1.0
+
+    def correct(self, frames: Frames) -> Frames:
+        """The points where they are, with the noise that is left."""
+        r = np.linalg.norm(frames.points, axis=1)
+        u = frames.points / r[:, None]
+        squeeze = np.eye(3) + (self.along - 1.0) * u[:, :, None] * u[:, None]
+        return replace(
+            frames, points=frames.points * self._stretch(frames)[:, None], covs=squeeze @ frames.covs @ squeeze
+        )
+
+    def _stretch(self, frames: Frames) -> Array:
+        cosine = frames.points[:, 2] / np.linalg.norm(frames.points, axis=1)
+        stretch: Array = np.clip(cosine, 0.2, 1.0) ** -self.power
+        return stretch
+
+
+def delayed(T: Array, stamps: Array, lag_s: float) -> Array:
+    """Poses (n, 4, 4) as they were ``lag_s`` earlier, interpolated."""
+    if lag_s == 0.0 or len(T) < 2:
+        return T
+    t = np.clip(stamps - lag_s, stamps[0], stamps[-1])
+    i = np.clip(np.searchsorted(stamps, t, side="right") - 1, 0, len(stamps) - 2)
+    share = (t - stamps[i]) / (stamps[i + 1] - stamps[i])
+    return np.asarray(T[i] @ se3_exp(share[:, None] * se3_log(inverse(T[i]) @ T[i + 1])))
+
+
+def calibrate(frames: Frames, given: Array, config: ParticleConfig) -> Calibration:
+    """Estimate the errors of the instruments from a session with odometry ``given`` (n, 4, 4)."""
+    found = Calibration()
+    if not config.calibrate:
+        return found
+    usual = float(np.median(np.diff(frames.stamps)))
+    for _ in range(_N_ROUNDS):
+        now = replace(found, along=1.0)
+        piece = follow_points(now.correct(frames), delayed(given, frames.stamps, found.lag_s), _PATIENCE * usual)
+        a, b = pairs_of(frames, piece, _SPAN * usual)
+        if len(a) < _FEWEST_PAIRS:
+            return Calibration()
+        n = len(np.unique(np.concatenate([a, b])))
+
+        def along(power: float, now: Calibration = now, a: IntArray = a, b: IntArray = b) -> float:
+            return float(np.abs(_errors(frames, given, replace(now, power=power), a, b)[0]).mean())
+
+        power = _believed(along, _MAX_POWER, n)
+        now = replace(now, power=power)
+
+        def across(lag: float, now: Calibration = now, a: IntArray = a, b: IntArray = b) -> float:
+            return float(_errors(frames, given, replace(now, lag_s=lag), a, b)[1].mean())
+
+        now = replace(now, lag_s=_believed(across, _LAG_STEPS * usual, n))
+        found = replace(now, along=_left_along(frames, given, now, a, b) if power else 1.0)
+    return found
+
+
+def _believed(error: Callable[[float], float], limit: float, n: int) -> float:
+    """Where the mean absolute error is least, if that is likelier than zero by ``_LEAST_GAIN`` (n Laplace errors)."""
+    grid = np.linspace(-limit, limit, 25)
+    values = [error(float(x)) for x in grid]
+    k = int(np.argmin(values))
+    step = grid[1] - grid[0]
+    if k in (0, len(grid) - 1):
+        return 0.0  # no error of this kind: something else that it would hide
+    best = minimize_scalar(error, bounds=(grid[k] - step, grid[k] + step), method="bounded", options={"xatol": 1e-3})
+    gain = n * np.log(max(error(0.0), 1e-300) / max(float(best.fun), 1e-300))
+    return float(best.x) if gain > _LEAST_GAIN else 0.0
+
+
+def _left_along(frames: Frames, given: Array, now: Calibration, a: IntArray, b: IntArray) -> float:
+    """Factor on the stated sigma along the ray, from the spread of corrected points in pieces."""
+    error = _errors(frames, given, now, a, b)[0]
+    u = frames.points[b] / np.linalg.norm(frames.points[b], axis=1)[:, None]
+    stated = np.sqrt(np.einsum("ni,nij,nj->n", u, frames.covs[b], u))
+    sigma = 1.4826 * float(np.median(np.abs(error / stated))) / np.sqrt(2.0)
+    return float(min(1.0, _SLOW * sigma))
+
+
+def _errors(frames: Frames, given: Array, now: Calibration, a: IntArray, b: IntArray) -> tuple[Array, Array]:
+    """How far points b are from where points a let them expect, along the ray (signed) and across it, (k,) each."""
+    T = delayed(given, frames.stamps, now.lag_s)
+    points = now.correct(frames).points
+    expected = transform(inverse(T[frames.frame[b]]) @ T[frames.frame[a]], points[a])
+    error = points[b] - expected
+    u = points[b] / np.linalg.norm(points[b], axis=1)[:, None]
+    along = (error * u).sum(axis=1)
+    return along, np.linalg.norm(error - along[:, None] * u, axis=1)
+
+
+def follow_points(frames: Frames, T: Array, patience_s: float) -> IntArray:
+    """Piece (m,) of each point: one to one from frame to frame by poses T (n, 4, 4), within a gate."""
+    piece = np.full(len(frames), -1)
+    ends: list[int] = []
+    n_pieces = 0
+    for i in range(frames.n_frames):
+        ends = [a for a in ends if frames.stamps[i] - frames.stamps[frames.frame[a]] < patience_s]
+        here = np.arange(frames.starts[i], frames.starts[i + 1])
+        if ends and len(here):
+            for row, k in _next_points(frames, T, i, np.array(ends), here):
+                piece[here[k]] = piece[ends[row]]
+                ends[row] = int(here[k])
+        for k in here[piece[here] < 0].tolist():
+            piece[k] = n_pieces
+            n_pieces += 1
+            ends.append(k)
+    return piece
+
+
+def _next_points(frames: Frames, T: Array, i: int, ends: IntArray, here: IntArray) -> list[tuple[int, int]]:
+    """Which of the pieces that end in ``ends`` go on in which point of frame i: pairs of rows."""
+    expected = transform(inverse(T[i]) @ T[frames.frame[ends]], frames.points[ends])
+    error = frames.points[here][None] - expected[:, None]
+    white = np.linalg.solve(np.linalg.cholesky(frames.covs[here])[None], error[..., None])[..., 0]
+    chi2 = (white * white).sum(axis=-1)
+    rows, columns = linear_sum_assignment(np.minimum(chi2, 4.0 * _GATE))
+    return [(int(r), int(k)) for r, k in zip(rows, columns, strict=True) if chi2[r, k] < _GATE]
+
+
+def pairs_of(frames: Frames, piece: IntArray, span_s: float) -> tuple[IntArray, IntArray]:
+    """Earlier and later points (k,), (k,) of the same piece, at most ``span_s`` apart."""
+    order = np.lexsort((frames.frame, piece))
+    p, t = piece[order], frames.stamps[frames.frame[order]]
+    early, late = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
+    for k in range(1, len(order)):
+        same = (p[k:] == p[:-k]) & (t[k:] - t[:-k] <= span_s)
+        if not same.any():
+            break
+        early.append(order[:-k][same])
+        late.append(order[k:][same])
+    a, b = np.concatenate(early), np.concatenate(late)
+    stride = len(a) // _MOST_PAIRS + 1
+    return a[::stride], b[::stride]
