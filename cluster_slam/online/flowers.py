@@ -23,6 +23,7 @@ _FIELDS: dict[str, tuple[tuple[int, ...], type]] = {
     "looks": ((), np.float64),  # frames that looked at it, old ones forgotten
     "found": ((), np.float64),  # of those, how many saw it
     "confirmed": ((), np.bool_),
+    "told": ((), np.bool_),  # its id has been given out
     "seat": ((), np.int64),  # of a confirmed flower in the grouping's sums, -1 of a tentative one
 }
 
@@ -43,6 +44,7 @@ class FlowerTable:
     looks: Array
     found: Array
     confirmed: BoolArray
+    told: BoolArray
     seat: IntArray
 
     def __init__(self) -> None:

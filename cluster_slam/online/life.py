@@ -38,10 +38,11 @@ def live(world: World, seen: Seen, view: View, T: Array, w: Array) -> tuple[IntA
     reasons = np.where(row_of >= 0, int(RejectReason.ACCEPTED), int(RejectReason.POSITION_GATE))
     n_born = bear(world, seen, view, T, w, row_of, reasons)
     shown = row_of >= 0
-    young = shown & (table.n[row_of] < 2)
-    if n_born <= _MANY * world.clutter_rate:
-        shown &= ~young
-    reasons[young & ~shown] = int(RejectReason.UNCONFIRMED)
+    rows = row_of[shown]
+    is_flower = (table.n[rows] >= world.config.confirm_hits) | (n_born > _MANY * world.clutter_rate)
+    table.told[rows] |= is_flower
+    shown[shown] = table.told[rows]
+    reasons[(row_of >= 0) & ~shown] = int(RejectReason.UNCONFIRMED)
     confirm(world, view.stamp)
     return np.where(shown, table.ids[row_of] if len(table) else -1, -1), reasons
 
