@@ -367,6 +367,42 @@ def merge(
     return 0
 
 
+@app.command("optimise", short_help="Smooth all sessions of each plant together.")
+def optimise(
+    path: MapArgument,
+    plant: Annotated[
+        str | None, typer.Option("--plant", metavar="NAME", help="Only this plant.", show_default=False)
+    ] = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> int:
+    """Smooth all sessions of each plant in one graph: where each base stood, where each cluster is and how it drifts.
+
+    Sessions before it can no longer be undone.
+
+    Example: cluster-slam map optimise field.map --plant row3
+    """
+    from dataclasses import asdict
+
+    from cluster_slam.io.map import open_map
+    from cluster_slam.remember.optimise import optimise_plant
+
+    with open_map(path) as store, StageProgress(is_shown=not (quiet or as_json)) as progress:
+        names = store.plant_names() if plant is None else [store.plant(plant).name]
+        found = []
+        for k, name in enumerate(names):
+            progress(f"smoothing {name}", k / len(names))
+            found.append(optimise_plant(store, name))
+    done = [each for each in found if each is not None]
+    if as_json:
+        print_json({"plants": [asdict(each) for each in done]})
+    elif not quiet:
+        text = "{} sessions, {} sightings, residuals {:.2f} -> {:.2f} sigma"
+        rows = [(d.plant, text.format(d.n_sessions, d.n_sightings, d.rms_before, d.rms_after)) for d in done]
+        print_table("cluster-slam map optimise", rows or [("verdict", "no plant has two sessions")])
+    return 0
+
+
 @app.command("event", short_help="Record what was done to a cluster.")
 def event(
     path: MapArgument,

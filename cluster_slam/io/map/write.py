@@ -55,8 +55,8 @@ def put(connection: sqlite3.Connection, entry: Entry) -> None:
     session_id = connection.execute("SELECT coalesce(max(id), 0) + 1 FROM sessions").fetchone()[0]
     changed = _changed(connection, entry.plant, plant_id)
     _session(connection, entry, session_id, plant_id)
-    _upsert(connection, "clusters", N_CLUSTER_COLUMNS, changed["clusters"][0])
-    _upsert(connection, "flowers", N_FLOWER_COLUMNS, changed["flowers"][0])
+    upsert(connection, "clusters", N_CLUSTER_COLUMNS, changed["clusters"][0])
+    upsert(connection, "flowers", N_FLOWER_COLUMNS, changed["flowers"][0])
     _observations(connection, entry, session_id)
     _count_up(connection, entry.plant)
     journal = {"plant": before, **{name: rows for name, (_, rows) in changed.items()}}
@@ -101,7 +101,8 @@ def _changed(connection: sqlite3.Connection, plant: PlantMap, plant_id: int) -> 
     return out
 
 
-def _upsert(connection: sqlite3.Connection, table: str, width: int, rows: list[Row]) -> None:
+def upsert(connection: sqlite3.Connection, table: str, width: int, rows: list[Row]) -> None:
+    """Write rows, over those of the same id."""
     names = [row[1] for row in connection.execute(f"PRAGMA table_info({table})")]
     changes = ", ".join(f"{name}=excluded.{name}" for name in names[1:])
     marks = ", ".join("?" * width)
@@ -197,7 +198,7 @@ def undo(store: MapStore) -> StoredSession:
 
 
 def _restore(connection: sqlite3.Connection, table: str, width: int, rows: list[list[object]]) -> None:
-    _upsert(connection, table, width, [tuple(row) for row in rows])
+    upsert(connection, table, width, [tuple(row) for row in rows])
 
 
 def _check_events(connection: sqlite3.Connection, store: MapStore, last: StoredSession, new: list[int]) -> None:
