@@ -491,6 +491,33 @@ def export(
     return 0
 
 
+@app.command("report", short_help="A page with a slider over dates.")
+def report(
+    path: MapArgument,
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE.html", help="Page to write.", show_default=False)],
+    plant: Annotated[
+        str | None, typer.Option("--plant", metavar="NAME", help="Only this plant.", show_default=False)
+    ] = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> int:
+    """Write the season report: plants in 3-D by date, life lines, drift, events, each alignment before and after.
+
+    Example: cluster-slam map report field.map -o season.html
+    """
+    from cluster_slam.io.map import open_map
+    from cluster_slam.io.map.file import write_file
+    from cluster_slam.report.season import render_season
+
+    with open_map(path) as store:
+        write_file(out, render_season(store, plant))
+    if as_json:
+        print_json({"out": str(out)})
+    elif not quiet:
+        print_table("cluster-slam map report", [("page", str(out))])
+    return 0
+
+
 @app.command("check", short_help="Is a map whole?")
 def check(path: MapArgument, quiet: QuietOption = False, as_json: JsonOption = False) -> int:
     """Check that a map is whole: the file, what refers to what, all numbers. Exit code 1 and the reasons if it is not.
