@@ -15,6 +15,8 @@ from cluster_slam.association.frames import information
 from cluster_slam.geometry import Array
 from cluster_slam.records import IntArray
 
+_HUBER_CHI2 = 7.8  # 3 degrees of freedom, 95 %
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseSolution:
@@ -68,7 +70,8 @@ def solve_pose(
         if i + 1 < n_iterations:
             d = (information(A + inverse_P) @ (B @ z - b)[..., None])[..., 0]
             r = residual - J @ z + d[s]
-            weight = 1.0 / (1.0 + np.einsum("qi,qij,qj->q", r, W, r) / 6.0)
+            # Huber: Gaussian errors keep their full weight, and the covariances stay true.
+            weight = np.minimum(1.0, np.sqrt(_HUBER_CHI2 / np.maximum(np.einsum("qi,qij,qj->q", r, W, r), 1e-9)))
     # What a cluster's displacement is measured to be, its own flowers' and all others' word on the pose taken together.
     own = H - H_of + np.tensordot(sums, JWJ, 1)
     gain = np.swapaxes(np.linalg.solve(own, np.swapaxes(B, 1, 2)), 1, 2)
