@@ -27,12 +27,17 @@ def line_motion(folder: Path, seconds: float = 100.0) -> Path:
     return path
 
 
+def free_host() -> str:
+    """An address of this machine that no other test uses, in whatever process."""
+    pid = os.getpid()
+    return f"127.{pid // 250 % 200 + 20}.{pid % 250 + 1}.{next(_NUMBER)}"
+
+
 class EmulatedRobot:
     """``cluster-slam rtde-emulator`` with its faults on stdin. Use it as a context manager."""
 
     def __init__(self, motion: Path, *options: str) -> None:
-        pid = os.getpid()
-        self.host = f"127.{pid // 250 % 200 + 20}.{pid % 250 + 1}.{next(_NUMBER)}"
+        self.host = free_host()
         program = [sys.executable, "-m", "cluster_slam.cli", "rtde-emulator", str(motion), "--bind", self.host]
         self._command = [*program, "--control", "--json", "--uptime", str(UPTIME), *options]
         self.summary: dict[str, Any] = {}

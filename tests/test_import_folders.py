@@ -66,6 +66,18 @@ def test_a_tum_folder(tmp_path: Path) -> None:
     assert read_camera(out / "camera.yaml").cx == 15.5
 
 
+def test_a_session_of_pictures_keeps_its_mount(tmp_path: Path) -> None:
+    """A folder that is a session already: what its poses are of is not forgotten."""
+    folder = tum_folder(tmp_path / "t")
+    (folder / "groundtruth.txt").rename(folder / "poses.txt")
+    frames = '[frames]\npose = "T_world_flange"\nT_flange_camera = [0.0, 0.0, 0.05, 0.0, 0.0, 0.0, 1.0]\n'
+    (folder / "session.toml").write_text(f'format = 1\nid = "mine"\n{frames}[depth]\nscale = 0.0001\n')
+    assert run(["import", str(folder), "-o", str(tmp_path / "s"), "--quiet"]) == 0
+    metadata, _ = read_metadata(tmp_path / "s" / "session.toml")
+    assert (metadata.id, metadata.frames.pose, metadata.depth.scale) == ("mine", "T_world_flange", 0.0001)
+    assert metadata.frames.T_flange_camera == [0.0, 0.0, 0.05, 0.0, 0.0, 0.0, 1.0]
+
+
 def open3d_folder(folder: Path) -> tuple[Path, np.ndarray]:
     """Three numbered images with intrinsics column by column and a Redwood log."""
     for name in ("color", "depth"):

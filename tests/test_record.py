@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from rtde_help import SPEED, EmulatedRobot, line_motion
+from rtde_help import SPEED, EmulatedRobot, free_host, line_motion
 
 from cluster_slam.cli.app import run
 from cluster_slam.geometry import so3_log
@@ -176,7 +176,7 @@ def test_the_arm_alone_until_ctrl_c(tmp_path: Path) -> None:
     assert session.n_frames == told["robot_samples"] > 30
     assert len(session.observations) == 0
     assert read_rtde_csv(out / "robot.csv").poses.shape == (session.n_frames, 4, 4)
-    assert run(["rtde-emulator", str(out / "robot.csv"), "--duration", "0", "--bind", "127.0.0.99", "--quiet"]) == 0
+    assert run(["rtde-emulator", str(out / "robot.csv"), "--duration", "0", "--bind", free_host(), "--quiet"]) == 0
 
 
 def test_whoever_is_killed_loses_a_second(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -81,7 +81,7 @@ def command(
 
 def _run(emulator: Emulator, faults: list[Fault], duration: float | None, reader: threading.Thread | None) -> None:
     """Let faults happen when they are due, until time is up, stdin ends, or somebody stops us."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    former = signal.signal(signal.SIGTERM, signal.default_int_handler)
     begin = time.monotonic()
     try:
         while duration is None or time.monotonic() - begin < duration:
@@ -92,6 +92,8 @@ def _run(emulator: Emulator, faults: list[Fault], duration: float | None, reader
             time.sleep(0.02)
     except KeyboardInterrupt:
         return
+    finally:
+        signal.signal(signal.SIGTERM, former)
 
 
 def _read_control(emulator: Emulator) -> threading.Thread:

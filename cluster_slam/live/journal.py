@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
+from collections import deque
 from collections.abc import Iterable
 from io import TextIOWrapper
 from pathlib import Path
@@ -66,6 +67,7 @@ class Journal:
         self._head = head
         self._synced = time.monotonic()
         self._has_camera = False
+        self._last_stamps: deque[float] = deque(maxlen=300)
         self.n_samples = self.n_views = 0
 
     def __enter__(self) -> Journal:
@@ -101,6 +103,9 @@ class Journal:
 
     def view(self, view: View, stamp: float) -> None:
         """What the camera saw at a time of this machine's clock."""
+        if stamp in self._last_stamps:  # a camera that repeats itself
+            return
+        self._last_stamps.append(stamp)
         self.n_views += 1
         word = number(stamp)
         for point, score, cov in zip(view.points.tolist(), view.scores.tolist(), view.covs, strict=True):

@@ -44,14 +44,23 @@ class Clock:
 
 def fit_clock(stamps: Array, arrivals: Array) -> Clock:
     """The clock of stamps (n,) and the times (n,) at which they arrived, n > 0."""
+    span = float(np.ptp(stamps))
+    stamps, arrivals = _earliest(stamps, arrivals)
     reference = float(stamps.mean())
     x, y = stamps - reference, arrivals - stamps
-    span = float(np.ptp(stamps))
     drift = _hull_slope(x, y) if span >= _MIN_SPAN_S else 0.0
     drift = min(max(drift, -MAX_DRIFT), MAX_DRIFT)
     late = y - drift * x
     offset = float(late.min())
     return Clock(reference, offset, drift, float(np.median(late)) - offset, span)
+
+
+def _earliest(stamps: Array, arrivals: Array) -> tuple[Array, Array]:
+    """Of each second the pair with the smallest delay: only these can matter."""
+    order = np.lexsort((arrivals - stamps, stamps // _BIN_S))
+    _, first = np.unique(stamps[order] // _BIN_S, return_index=True)
+    kept = order[first]
+    return stamps[kept], arrivals[kept]
 
 
 def _hull_slope(x: Array, y: Array) -> float:

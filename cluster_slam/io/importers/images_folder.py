@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from cluster_slam.io.camera_info import read_camera
 from cluster_slam.io.importers.poses import read_pose_file
 from cluster_slam.io.importers.recording import Imported, ImportOptions, Picture, Stream
 from cluster_slam.io.importers.session_files import SessionHead
+from cluster_slam.io.metadata import read_metadata
 from cluster_slam.io.text import read_text, shown
 from cluster_slam.records import PoseFrame
 from cluster_slam.sensors.camera import Camera
@@ -50,8 +52,26 @@ def read_tum_folder(folder: Path, options: ImportOptions) -> Imported:
     if options.camera_file is None and not own.is_file():
         raise InputError(f"{folder}: no intrinsics (no camera.yaml), expected --camera FILE.yaml")
     there = [folder / name for name in _TRAJECTORIES if (folder / name).is_file()]
+    options = _as_session(folder, options)
     return _imported(
         folder, "TUM RGB-D folder", options, lists, read_camera(options.camera_file or own), there, TUM_SCALE
+    )
+
+
+def _as_session(folder: Path, options: ImportOptions) -> ImportOptions:
+    """What a ``session.toml`` in the folder says, where the options say nothing."""
+    if not (folder / "session.toml").is_file():
+        return options
+    metadata, _ = read_metadata(folder / "session.toml")
+    mount = metadata.frames.T_flange_camera if metadata.frames.pose == "T_world_flange" else None
+    known = options.T_flange_camera is not None or mount is None
+    return replace(
+        options,
+        id=options.id or metadata.id,
+        plant=options.plant or metadata.plant,
+        pose_frame=options.pose_frame or metadata.frames.pose,
+        T_flange_camera=options.T_flange_camera if known else np.array(mount),
+        depth_scale=options.depth_scale or metadata.depth.scale,
     )
 
 
