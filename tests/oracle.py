@@ -34,9 +34,9 @@ def smooth_with_truth(session: Session, truth: Truth, config: SmoothConfig | Non
         noise=VarianceFactors(1.0, 1.0, 1.0),
         held=np.zeros((6, 6)),
     )
-    for _ in range(3):  # each time with the displacements and the noise that the one before found
+    for in_stretches in (False, False, True):  # each time with the displacements and the noise that were found before
         frames, model = for_solving(stated, stated_poses, world)
-        smoother, estimate = solve(frames, model, world, config, 6)
+        smoother, estimate = solve(frames, model, world, config, 6, in_stretches=in_stretches)
         world = learn(world, smoother, estimate)
     marginals = smoother.marginals(estimate)
     return make_result(session, frames, world, smoother, estimate, marginals, config, 0, [], {})

@@ -21,6 +21,7 @@ from cluster_slam.smoothing.rounds import (
     mend,
     observations_err_slowly,
     regroup,
+    same_groups,
     settle,
     solve,
 )
@@ -65,11 +66,15 @@ def smooth(
     if world.cov_step is None and not world.errs_slowly:
         world = settle(frames, world, smoother, estimate)
     world = learn(world, smoother, estimate)
-    if world.cov_step is None:
-        world = regroup(frames, world, estimate, config, rng)
-    frames, model = for_solving(stated, stated_poses, world)
-    smoother, estimate = solve(frames, model, world, config, 2, in_stretches=True)
-    world = learn(world, smoother, estimate)
+    drifts = world.cov_step is not None
+    for i in range(config.max_rounds):
+        grouped = world if drifts else regroup(frames, world, estimate, config, rng)
+        if i > 0 and same_groups(world, grouped):
+            break
+        world = grouped
+        frames, model = for_solving(stated, stated_poses, world)
+        smoother, estimate = solve(frames, model, world, config, 2, in_stretches=True)
+        world = learn(world, smoother, estimate)
     if world.errs_slowly:  # all observations of a flower say the same: its place is as uncertain as one of them
         smoother.correlation = float(np.bincount(smoother.landmark, minlength=1).max())
     _, smoother.poses = with_variances(stated, stated_poses, world.noise)

@@ -110,10 +110,13 @@ def observations_err_slowly(frames: Frames, model: PoseModel, world: World) -> b
 
 
 def regroup(frames: Frames, world: World, estimate: Estimate, config: SmoothConfig, rng: np.random.Generator) -> World:
-    """Group the flowers again, now that it is known how each moved; outliers have no say."""
+    """Group the flowers again, now that it is known how each moved.
+
+    What was claimed only since the estimate was made has no say; outliers have, for in a wrong group all are outliers.
+    """
     n = len(world.places)
     presence = presence_of(frames.frame, world.landmark, n, frames.n_frames)
-    used = (world.landmark >= 0) & (estimate.weight > 0.5)
+    used = (world.landmark >= 0) & np.isfinite(estimate.residual_chi2)
     u = np.full((frames.n_frames, n, 3), np.nan)
     var = np.full((frames.n_frames, n), np.nan)
     at = (frames.frame[used], world.landmark[used])
@@ -125,6 +128,12 @@ def regroup(frames: Frames, world: World, estimate: Estimate, config: SmoothConf
             world.places, presence, Motion(u, var, frames.stamps), view_volume(frames), config.grouping, rng=rng
         ),
     )
+
+
+def same_groups(a: World, b: World) -> bool:
+    """Whether two worlds with the same flowers have the same clusters, whatever their numbers."""
+    both = np.unique(np.stack([a.cluster, b.cluster]), axis=1).shape[1]
+    return both == len(np.unique(a.cluster)) == len(np.unique(b.cluster))
 
 
 def settle(frames: Frames, world: World, smoother: BatchSmoother, estimate: Estimate) -> World:

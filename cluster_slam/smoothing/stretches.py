@@ -32,6 +32,18 @@ class Series:
         self.values[frame, cluster] = d
         self.seen[frame, cluster] = 1.0
 
+    def own_covariance(self, lag: int) -> tuple[float, float]:
+        """The same without what all clusters have in common: that is an error of the pose, or of the mounting."""
+        value, count = self.covariance(lag)
+        if lag >= len(self.values):
+            return value, count
+        early, late = self.values[:-lag], self.values[lag:]
+        seen_early, seen_late = self.seen[:-lag], self.seen[lag:]
+        n_both = float((seen_early.sum(axis=1) * seen_late.sum(axis=1)).sum()) - count
+        both = float((early.sum(axis=1) * late.sum(axis=1)).sum()) - 3.0 * count * value
+        common = both / (3.0 * n_both) if n_both >= _FEWEST else 0.0
+        return value - max(common, 0.0), count
+
     def covariance(self, lag: int) -> tuple[float, float]:
         """Mean product along any axis of displacements ``lag`` frames apart, and how many products that is."""
         if lag >= len(self.values):
@@ -54,7 +66,7 @@ def rest_sigma(d: Array, cov: Array, scale: Array, frame: IntArray, cluster: Int
     size = (d[calm] ** 2).sum(axis=1)
     usual = np.flatnonzero(calm)[size <= 16.0 * np.trace(cov[calm], axis1=1, axis2=2)]
     series = Series(d[usual], frame[usual], cluster[usual], stamps)
-    (first, n_first), (second, n_second) = series.covariance(1), series.covariance(2)
+    (first, n_first), (second, n_second) = series.own_covariance(1), series.own_covariance(2)
     if n_first + n_second < _FEWEST:
         return 0.3 * noise
     shared = (first * n_first + second * n_second) / (n_first + n_second)
