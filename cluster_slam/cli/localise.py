@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cluster_slam.cli.options import ConfigOption, JsonOption, QuietOption, SessionArgument, SetOption, configured
+from cluster_slam.cli.options import (
+    ConfigOption,
+    JsonOption,
+    QuietOption,
+    SeedOption,
+    SessionArgument,
+    SetOption,
+    configured,
+)
 from cluster_slam.cli.progress import StageProgress
 from cluster_slam.cli.summary import print_json, print_table, print_warnings
 from cluster_slam.config import LocaliseConfig
@@ -32,6 +40,8 @@ def command(
             "--window", metavar="N", min=1, help="Each frame from the last N frames only.", show_default=False
         ),
     ] = None,
+    smooth: Annotated[bool, typer.Option("--smooth", help="Poses from all frames, later ones too.")] = False,
+    seed: SeedOption = 0,
     config: ConfigOption = None,
     settings: SetOption = None,
     level: Annotated[
@@ -59,7 +69,16 @@ def command(
     with open_map(map_file) as store:
         plants = store.plants()
     with StageProgress(is_shown=not (quiet or as_json)) as progress:
-        found = localise(opened, plants, config=options, independent=independent, window=window, progress=progress)
+        found = localise(
+            opened,
+            plants,
+            config=options,
+            independent=independent,
+            window=window,
+            smooth=smooth,
+            seed=seed,
+            progress=progress,
+        )
         write_localisation(found, out)
     if as_json:
         print_json({**json.loads((out / "run.json").read_text("utf-8")), "out": str(out)})

@@ -131,6 +131,7 @@ class Follower:
                 h.fit.rows,
                 h.fit.flowers,
                 h.fit.T_map_camera,
+                np.diag(np.full(6, 1e6)),
                 log_likelihood,
                 nis,
                 0.0,

@@ -42,7 +42,8 @@ class Step:
     cov: Array  # (6, 6)
     rows: IntArray  # (m,) points that are flowers of the map
     flowers: IntArray  # (m,) which (indices of the landmarks)
-    predicted_T: Array  # (4, 4) before the frame was looked at
+    predicted_T: Array  # (4, 4) before the frame was looked at ...
+    predicted_cov: Array  # (6, 6) ... and its covariance
     log_likelihood: float  # of the matched points, given all frames before
     nis: float  # of all matched points together
     pose_error_sq: float  # of the given pose or step, as estimated, squared in units of its stated covariance ...
@@ -256,7 +257,7 @@ class Track:
         log_likelihood, nis = self.update(look, rows, flowers) if len(rows) else (0.0, 0.0)
         after = self.pose_cov.copy()
         surprise = _pose_surprise(added, before, after, se3_log(inverse(predicted) @ self.T))
-        return Step(frame, self.T, after, rows, flowers, predicted, log_likelihood, nis, *surprise)
+        return Step(frame, self.T, after, rows, flowers, predicted, before, log_likelihood, nis, *surprise)
 
 
 def _pose_surprise(added: Array, before: Array, after: Array, moved: Array) -> tuple[float, float]:

@@ -10,12 +10,15 @@ from time import perf_counter
 import numpy as np
 
 from cluster_slam.config import LocaliseConfig
+from cluster_slam.geometry import inverse, se3_exp, se3_log
 from cluster_slam.localisation import Landmarks, Localisation, Localiser
 from cluster_slam.localisation.following import Follower, Place
 from cluster_slam.localisation.learning import Seen, learn_scale
 from cluster_slam.localisation.motion import Motion, motion_of
+from cluster_slam.localisation.planar import Flat, FlatFollower, flat_world
 from cluster_slam.localisation.scene import ErrorScale, Look, make_look
 from cluster_slam.records import CLUTTER, IntArray, PlantMap, PoseHypotheses, Session, SessionLocalisation
+from tracking.gating import chi2_threshold
 
 Progress = Callable[[str, float], None]
 _N_LEARNING = 40  # frames from which the errors' scale is learnt, spread over the session
@@ -29,6 +32,8 @@ def localise(
     config: LocaliseConfig | None = None,
     independent: bool = False,
     window: int | None = None,
+    smooth: bool = False,
+    seed: int = 0,
     progress: Progress | None = None,
 ) -> SessionLocalisation:
     """Where the frames of a session are in a map.
@@ -40,6 +45,8 @@ def localise(
     config : the options, defaults where None.
     independent : every frame is kidnapped; poses are not used at all.
     window : every frame is located from so many frames that end with it, and forgets what was before. None: all.
+    smooth : poses from all frames, later ones too.
+    seed : of what is random (vehicles on a floor only).
     progress : called with the stage in words and a fraction 0..1.
 
     Raises
@@ -57,15 +64,22 @@ def localise(
     frames = _Frames(session, localiser)
     ready = perf_counter()
     say("learning how large the errors are", 0.02)
-    frames.learn()
     motion = motion_of(session)
-    if independent or window == 1:
+    frames.learn()
+    flat = None if independent or window else _flat_world(session, motion, localiser)
+    if flat is not None:
+        places = _on_floor(frames, flat, localiser.plants[0], motion, seed, say)
+    elif independent or window == 1:
         places = [frames.alone(i) for i in _told(session.n_frames, say)]
     elif window is not None:
         places = [_from_window(frames, motion, i, window) for i in _told(session.n_frames, say)]
     else:
         frames.learn_poses(motion)
         places = _followed(frames, motion, _told(session.n_frames, say))
+        if smooth:
+            backwards = _followed(frames, motion, range(session.n_frames - 1, -1, -1))[::-1]
+            fuse = _fused if motion.is_odometry else _surer
+            places = [fuse(a, b) for a, b in zip(places, backwards, strict=True)]
     timings = {"map": ready - begin, "localising": perf_counter() - ready}
     return _session_localisation(session, frames, places, config, timings)
 
@@ -151,6 +165,57 @@ def _followed(frames: _Frames, motion: Motion, order: Iterable[int]) -> list[Pla
     """Frames one after the other: kidnapped first, then tracked."""
     follower = Follower(frames.localiser, motion, frames.scale, frames.search, frames.localiser.config.sway_time_s)
     return [follower.step(i, frames.look(i)) for i in order]
+
+
+def _surer(forwards: Place, backwards: Place) -> Place:
+    """Of two directions of time the one that is surer.
+
+    Where each given pose errs for itself the directions cannot be fused: both hold the frame's own given pose. What
+    the other frames add is where the world is in the map, and the direction that has seen more frames knows that best.
+    """
+    if forwards.reason != "" or forwards.cov is None:
+        return backwards
+    if backwards.reason != "" or backwards.cov is None:
+        return forwards
+    return forwards if np.trace(forwards.cov) <= np.trace(backwards.cov) else backwards
+
+
+def _fused(forwards: Place, backwards: Place) -> Place:
+    """What both directions of time say of a frame (the two-filter smoother of Fraser and Potter, 1969).
+
+    The second comes in as it was before it looked at the frame, so that no frame counts twice. Where they cannot both
+    be right the frame stays as the first has it.
+    """
+    if forwards.reason != "":
+        return backwards
+    other, one = backwards.step, forwards
+    if backwards.reason != "" or other is None or one.cov is None or one.T_map_camera is None:
+        return forwards
+    xi = se3_log(inverse(one.T_map_camera) @ other.predicted_T)
+    total = one.cov + other.predicted_cov
+    gain = np.linalg.solve(total, one.cov).T
+    if xi @ np.linalg.solve(total, xi) > chi2_threshold(6, 0.9999):
+        return forwards
+    cov = one.cov - gain @ one.cov
+    return replace(one, T_map_camera=one.T_map_camera @ se3_exp(gain @ xi), cov=0.5 * (cov + cov.T))
+
+
+def _flat_world(session: Session, motion: Motion, localiser: Localiser) -> Flat | None:
+    """The planes of a vehicle's motion and of its landmarks, where there is one plant and all is flat."""
+    return flat_world(session, motion, localiser.plants[0]) if len(localiser.plants) == 1 else None
+
+
+def _on_floor(frames: _Frames, flat: Flat, marks: Landmarks, motion: Motion, seed: int, say: Progress) -> list[Place]:
+    """Frames of a vehicle on a floor, one after the other."""
+    follower = FlatFollower(flat, marks, motion, np.random.default_rng(seed))
+    o, out = frames.session.observations, []
+    for i in _told(frames.session.n_frames, say):
+        p = follower.step(i, o.points[frames.rows[i]], o.covs[frames.rows[i]])
+        only = ((p.probability, p.T_map_camera),)
+        out.append(
+            Place(p.reason, marks.plant, p.probability, p.T_map_camera, p.cov, p.flower_ids, p.cluster_ids, only)
+        )
+    return out
 
 
 def _from_window(frames: _Frames, motion: Motion, i: int, window: int) -> Place:
