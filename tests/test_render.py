@@ -176,3 +176,21 @@ def test_a_rendered_session_on_disk(tmp_path: Path) -> None:
     level2 = open_session(tmp_path / "d")
     assert level2.level == 2
     np.testing.assert_allclose(level2.observations.points, session.observations.points, atol=2e-3)
+
+
+def test_our_detector_finds_what_is_rendered(pictures: list[Picture]) -> None:
+    """Small as a file; of flowers that are wholly seen and 10 pixels wide it finds most, within a fifth of their width."""
+    from cluster_slam.detect import open_detector
+    from cluster_slam.detect.onnx import own_model
+
+    assert own_model().stat().st_size < 1_000_000
+    detector = open_detector()
+    n_found, n_shown = 0, 0
+    for picture in pictures:
+        found, b = detector.detect(picture.colour), picture.boxes
+        for k in np.flatnonzero((b.visible > 0.9) & (b.sizes.min(1) > 10)):
+            n_shown += 1
+            away = np.linalg.norm(found.centres - b.centres[k], axis=1).min(initial=np.inf)
+            n_found += int(away < 0.2 * b.sizes[k].max())
+    assert n_shown >= 8
+    assert n_found >= 0.7 * n_shown

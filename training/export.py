@@ -14,7 +14,7 @@ METADATA = {
     "stride": "16",
     "names": "{0: 'flower'}",
     "license": "MIT",
-    "score": "0.35",
+    "score": "0.45",
     "pixel_origin": "centre",
 }
 

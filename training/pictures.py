@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,9 +65,9 @@ def random_world(rng: np.random.Generator) -> SimulateConfig:
     )
 
 
-def render_world(seed: int) -> list[Picture]:
-    """The pictures of one random plant; none where its flowers do not fit."""
-    config = random_world(np.random.default_rng([seed, 77]))
+def render_world(seed: int, changes: dict[str, Any] | None = None) -> list[Picture]:
+    """The pictures of one random plant, with changes; none where its flowers do not fit."""
+    config = replace(random_world(np.random.default_rng([seed, 77])), **(changes or {}))
     try:
         made = simulate_session(config, seed=seed)
     except ConfigError:

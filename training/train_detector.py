@@ -40,10 +40,21 @@ def main() -> None:
     print(f"written after {time.process_time():.0f} s of CPU: {chosen.out}", flush=True)
 
 
-def train(examples: list[Example], n_steps: int, limit_s: float) -> FlowerNet:
-    """A network after so many steps, or so many seconds of CPU; the learning rate falls along a cosine of either."""
-    net = FlowerNet().to(memory_format=torch.channels_last)  # three times as fast on a CPU
-    optimiser = torch.optim.AdamW(net.parameters(), lr=4e-3, weight_decay=1e-4)
+def train(
+    examples: list[Example],
+    n_steps: int,
+    limit_s: float,
+    *,
+    net: FlowerNet | None = None,
+    rate: float = 4e-3,
+    zoom: tuple[float, float] = (SIZE / CUT, 1.9),
+) -> FlowerNet:
+    """A network after so many steps, or so many seconds of CPU; the learning rate falls along a cosine of either.
+
+    ``net`` is trained on where one is given; ``zoom`` is the range by which crops are scaled.
+    """
+    net = (net or FlowerNet()).to(memory_format=torch.channels_last)  # three times as fast on a CPU
+    optimiser = torch.optim.AdamW(net.parameters(), lr=rate, weight_decay=1e-4)
     rng = np.random.default_rng(SEED)
     begin = time.process_time()
     average: dict[str, Tensor] = {}
@@ -52,8 +63,8 @@ def train(examples: list[Example], n_steps: int, limit_s: float) -> FlowerNet:
         if part >= 1.0:
             break
         for group in optimiser.param_groups:
-            group["lr"] = 4e-3 * min(1.0, (step + 1) / 100) * (0.02 + 0.98 * 0.5 * (1 + np.cos(np.pi * part)))
-        images, targets = batch(examples, rng)
+            group["lr"] = rate * min(1.0, (step + 1) / 100) * (0.02 + 0.98 * 0.5 * (1 + np.cos(np.pi * part)))
+        images, targets = batch(examples, rng, zoom)
         loss, parts = losses(net(images), targets)
         optimiser.zero_grad()
         loss.backward()
@@ -79,20 +90,20 @@ def averaged(average: dict[str, Tensor], net: FlowerNet, keep: float) -> dict[st
     return average
 
 
-def batch(examples: list[Example], rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+def batch(examples: list[Example], rng: np.random.Generator, zoom: tuple[float, float]) -> tuple[Tensor, Tensor]:
     """Images (n, 3, s, s) and targets (n, 7, s / 4, s / 4): heat, use, weight of the box, offset, log size."""
-    pairs = [altered(examples[int(rng.integers(len(examples)))], rng) for _ in range(BATCH)]
+    pairs = [altered(examples[int(rng.integers(len(examples)))], rng, zoom) for _ in range(BATCH)]
     images = np.stack([image for image, _ in pairs])
     wide = torch.from_numpy(images).contiguous(memory_format=torch.channels_last)
     return wide, torch.from_numpy(np.stack([target(boxes) for _, boxes in pairs]))
 
 
-def altered(example: Example, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def altered(example: Example, rng: np.random.Generator, zoom: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     """A crop turned by quarters, mirrored, scaled, in other colours: (3, s, s) red green blue 0..1, and its boxes."""
     import cv2
 
     image, boxes = example.image, example.boxes.copy()
-    scale = float(np.exp(rng.uniform(np.log(SIZE / CUT), np.log(1.9)))) if rng.random() < 0.6 else 1.0
+    scale = float(np.exp(rng.uniform(*np.log(zoom)))) if rng.random() < 0.6 else 1.0
     side = min(int(SIZE / scale), CUT)
     scale = SIZE / side
     low = rng.integers(0, CUT - side + 1, 2)
