@@ -59,11 +59,12 @@ class ParticleConfig:
     calibrate: bool = True  # clocks that differ and depths taken for ranges are found and corrected first
     gap_steps: float = 25.0  # usual steps without a point after which a map of its own begins ...
     fewest_points: int = 30  # ... if so many points are seen before the next one
-    n_motions: int = 8  # that are tried in a gap, beside what odometry says
-    submap_slack: float = 2.0  # sigmas of places are taken times this when maps are compared: they are bent, too
+    n_motions: int = 12  # that are tried in a gap, beside what odometry says
+    submap_slack: float = 3.0  # sigmas of places are taken times this when maps are compared: they are bent, too
     n_particles: int = 60  # for a stretch; twice as many after a gap
     n_tries: int = 3  # of a stretch after a gap; the best is kept
     stretch_points: int = 100  # points that are associated before all is smoothed again
+    n_redo: int = 2  # passes in which every stretch is associated again, at most
     ahead_points: int = 40  # that are looked at beyond, before a stretch is believed
     odometry_scale: float = 1.5  # stated sigmas of odometry are taken times this ...
     odometry_dof: float = 2.0  # ... and errors of a usual step from Student's t: wheels slip, clocks are late

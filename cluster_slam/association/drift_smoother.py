@@ -53,10 +53,22 @@ def steps_of(given: Array, cov_step: Array, stamps: Array, config: ParticleConfi
 
 
 class DriftSmoother:
-    """Poses and places from odometry and points, the association given."""
+    """Poses and places from odometry and points, the association given.
 
-    def __init__(self, frames: Frames, steps: Steps, point_dof: float) -> None:
+    ``known`` (l, 3) with ``known_information`` (l,) in 1/m^2 are the first l places as other observations have them.
+    """
+
+    def __init__(
+        self,
+        frames: Frames,
+        steps: Steps,
+        point_dof: float,
+        known: Array | None = None,
+        known_information: Array | None = None,
+    ) -> None:
         self.frames, self.steps, self.point_dof = frames, steps, point_dof
+        self.known = np.empty((0, 3)) if known is None else known
+        self.known_information = np.empty(0) if known_information is None else known_information
         self.information = information(frames.covs)
         self.step_information = np.linalg.inv(steps.cov)  # (s, d, d), well scaled
 
@@ -64,7 +76,8 @@ class DriftSmoother:
         """Twice the negative log-likelihood of points and steps, up to a constant."""
         rows, _, _, error = self._point_errors(T, places, label)
         chi2 = np.einsum("mi,mij,mj->m", error, self.information[rows], error)
-        return float(self.point_cost(chi2).sum() + self._step_cost(T))
+        moved = ((places[: len(self.known)] - self.known) ** 2).sum(axis=1) @ self.known_information
+        return float(self.point_cost(chi2).sum() + self._step_cost(T) + moved)
 
     def point_cost(self, chi2: Array) -> Array:
         """Twice the negative log-likelihood of points at squared normalised distances."""
@@ -143,6 +156,9 @@ class DriftSmoother:
         np.add.at(H, f, WP @ J_pose)
         np.add.at(g, f, (WP @ error[..., None])[..., 0])
         M, g_place = np.tile(_WEAK * np.eye(3), (n_places, 1, 1)), np.zeros((n_places, 3))
+        known = slice(0, len(self.known))
+        M[known] += self.known_information[:, None, None] * np.eye(3)
+        g_place[known] += self.known_information[:, None] * (self.known - places[known])
         np.add.at(M, label[rows], WL @ J_place)
         np.add.at(g_place, label[rows], (WL @ error[..., None])[..., 0])
         cross = np.zeros((n, n_places, d, 3))

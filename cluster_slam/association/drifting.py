@@ -1,10 +1,11 @@
 """Association where poses drift: the map grows stretch by stretch, all is smoothed after each, decisions are undone.
 
 Dead reckoning cannot be trusted for longer than a few seconds, so points are compared with landmarks from an
-*estimated* pose. Stretches are gone through with particles; then all poses and places so far are smoothed, all points
-are associated again, and landmarks are merged where that makes the whole likelier, each landmark having a price. In
-the end every stretch is associated once more, with the map that the others make. All this is done forwards and
-backwards in time, since one beginning may be easier than the other, and the likelier outcome is kept.
+*estimated* pose. First the instruments' own errors are taken out. What lies between two gaps is then mapped for
+itself, stretch by stretch, with particles: after each stretch all poses and places so far are smoothed, all points are
+associated again, and landmarks are merged where that makes the whole likelier, each landmark having a price. These
+maps are joined, the largest first: several motions in the gap are tried, and the likeliest whole is kept. In the end
+every stretch is associated once more, with the map that the others make.
 """
 
 from __future__ import annotations
@@ -114,7 +115,7 @@ class _Tracer:
         while low > 0 or high + 1 < len(parts):
             sides = [k for k in (low - 1, high + 1) if 0 <= k < len(parts)]
             ranked = [self._join(whole, parts[k]) for k in sides]
-            clearest = int(np.argmax([margin for _, margin in ranked]))
+            clearest = int(np.argmax([share for _, share in ranked]))
             whole = ranked[clearest][0]
             low, high = min(low, sides[clearest]), max(high, sides[clearest])
         return _State(whole.T, whole.label, whole.places, 0.0)
@@ -138,9 +139,9 @@ class _Tracer:
         return Part(first, first + len(state.T), state.T, state.label, state.places, var, self.frames.frame)
 
     def _join(self, a: Part, b: Part) -> tuple[Part, float]:
-        """Both parts as one, and by how much the second best way to join them is worse."""
+        """Both parts as one, and the share of the points of b that landmarks of a explain."""
         if len(b.places) == 0:
-            return joined(a, b, np.zeros(self.steps.basis.shape[1]), self.steps), np.inf
+            return joined(a, b, np.zeros(self.steps.basis.shape[1]), self.steps), 1.0
         tracer = self._window(min(a.first, b.first), max(a.end, b.end))
         price = self.config.growing_cost
         tries = []
@@ -149,8 +150,10 @@ class _Tracer:
             tries.append(tracer.settle(trial.T, trial.label, trial.places, price, 1))
         tries.sort(key=lambda state: state.cost)
         best = tracer.merge(tries[0], price)
-        others = [t.cost for t in tries[1:] if (t.label != tries[0].label).mean() > 0.02]
-        return tracer.as_part(best, min(a.first, b.first)), min(others, default=np.inf) - tries[0].cost
+        own = np.isin(tracer.frames.order, self._window(b.first, b.end).frames.order)
+        known = np.unique(best.label[np.logical_not(own)])
+        share = float(np.isin(best.label[own], known[known >= 0]).mean())
+        return tracer.as_part(best, min(a.first, b.first)), share
 
     def grow(self) -> _State:
         """Go through the session, stretch by stretch."""
@@ -197,10 +200,16 @@ class _Tracer:
         return self.merge(self.settle(state.T, state.label, state.places, price), price, 40)
 
     def redo(self, state: _State) -> _State:
-        """Associate every stretch again, with the landmarks that the others support, where that helps."""
+        """Associate every stretch again, with the landmarks that the others support, as long as that helps."""
         price = self.config.landmark_cost
-        for span in self._spans():
-            state = self._redo_span(state, span, price)
+        for _ in range(self.config.n_redo):
+            new = state
+            for span in self._spans():
+                new = self._redo_span(new, span, price)
+            new = self.merge(self.settle(new.T, new.label, new.places, price), price)
+            if new.cost >= state.cost - 1.0:
+                break
+            state = new
         return state
 
     def _spans(self) -> list[tuple[int, int]]:
@@ -211,29 +220,50 @@ class _Tracer:
         return list(zip(bounds[:-2], bounds[2:], strict=True)) or [(0, self.frames.n_frames)]
 
     def _redo_span(self, state: _State, span: tuple[int, int], price: float) -> _State:
+        """Associate the frames of a span again, if that is likelier there, the rest of the session standing still."""
         a, b = span
-        here = slice(int(self.frames.starts[a]), int(self.frames.starts[b]))
-        label = state.label.copy()
-        label[here] = -1
-        places, label = _compact(state.places, label)
-        others = _State(state.T, label, places, 0.0)
-        start = state.T[a - 1] if a else self.given[0]
+        first, end = max(0, a - (b - a) // 2), min(self.frames.n_frames, b + (b - a) // 2)
+        around = slice(int(self.frames.starts[first]), int(self.frames.starts[end]))
+        inside = slice(int(self.frames.starts[a]) - around.start, int(self.frames.starts[b]) - around.start)
+        elsewhere = state.label.copy()
+        elsewhere[around] = -1
+        covs = self._covs(_State(state.T, elsewhere, state.places, 0.0))
+        part = self._window(first, end)
+        smoother = DriftSmoother(part.frames, part.steps, self.config.point_dof, state.places, 1.0 / covs[:, 0, 0])
+        old = part.local(smoother, state.T[first:end], state.label[around], state.places)
+        start = state.T[max(a - 1, 0)]
         found = trace_stretch(
-            self.frames,
-            self.steps,
-            span,
+            part.frames,
+            part.steps,
+            (a - first, b - first),
             start,
-            places,
-            self._covs(others),
+            state.places,
+            covs,
             self.config.n_particles,
             self.config,
             rng=self.rng,
         )
-        label[here] = found.label
-        T = state.T.copy()
-        T[a:b] = found.T
-        new = self.settle(T, label, found.places, price, 2)
-        return self.merge(new, price, 4) if new.cost < state.cost - 1e-6 else state
+        T, label = state.T[first:end].copy(), state.label[around].copy()
+        T[a - first : b - first], label[inside] = found.T, found.label
+        new = part.local(smoother, T, label, found.places, inside)
+        n_new = len(np.unique(new.label[new.label >= len(state.places)]))
+        if new.cost + price * n_new >= old.cost - 1e-6:
+            return state
+        T, label = state.T.copy(), state.label.copy()
+        T[first:end], label[around] = new.T, new.label
+        return _State(T, label, np.concatenate([state.places, new.places[len(state.places) :]]), np.inf)
+
+    def local(
+        self, smoother: DriftSmoother, T: Array, label: IntArray, places: Array, again: slice | None = None
+    ) -> _State:
+        """Smoothed with places that others hold; the points ``again`` are associated once more."""
+        T, places = smoother.solve(T, places, label)
+        if again is not None:
+            label = label.copy()
+            label[again] = self._associate(smoother, T, places)[again]
+            T, places = smoother.solve(T, places, label)
+        clutter = self.config.clutter_cost * int((label < 0).sum())
+        return _State(T, label, places, smoother.cost(T, places, label) + clutter)
 
     def _covs(self, state: _State) -> Array:
         """How well places are known (l, 3, 3) relative to the latest pose: noise that repeats, and that does not."""
