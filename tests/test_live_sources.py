@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from folders import LEVEL_3, write_folder
+from folders import FLOWERS_COV, LEVEL_3, write_folder
 
 from cluster_slam.errors import ConfigError, InputError
 from cluster_slam.geometry import se3_exp, se3_log
 from cluster_slam.io.session import open_session
+from cluster_slam.live.collect import Collector
 from cluster_slam.live.motion_file import read_motion
 from cluster_slam.live.replay import Replay
 from cluster_slam.live.robot_poses import PoseState, RobotPoses
@@ -134,6 +136,29 @@ def test_a_session_at_its_pace(tmp_path: Path) -> None:
     begin = time.monotonic()
     assert len(list(Replay(session, is_realtime=True).frames())) == 3
     assert 0.2 <= time.monotonic() - begin < 2.0
+
+
+def test_frames_become_the_session_that_they_came_from(tmp_path: Path) -> None:
+    """Those without a pose, doubled or late are not kept."""
+    session = open_session(write_folder(tmp_path / "s", {**LEVEL_3, "flowers.csv": FLOWERS_COV}))
+    source = Replay(session)
+    collector = Collector(source.header)
+    first, second, third = source.frames()
+    lost = replace(second, pose=np.full((4, 4), np.nan))
+    assert [collector.add(f) for f in (first, lost, second, second, first, third)] == [
+        True,
+        False,
+        True,
+        False,
+        False,
+        True,
+    ]
+    made = collector.session()
+    assert np.array_equal(made.stamps, session.stamps)
+    assert np.array_equal(made.poses, session.poses)
+    for name in ("frame", "points", "covs", "scores"):
+        assert np.array_equal(getattr(made.observations, name), getattr(session.observations, name), equal_nan=True)
+    assert Collector(source.header).session().n_frames == 0
 
 
 # --- a folder that grows
