@@ -48,9 +48,25 @@ def identify(session: Constellation, match: Found, pose_probability: float) -> I
     pairs, new, _ = association_probabilities(ratio)
     flower = np.full(len(session.flower_ids), -1)
     flower[rows] = cols
+    if not match.single:
+        _with_their_clusters(match, flower)
     probability = np.where(flower >= 0, pose_probability * pairs[np.arange(len(flower)), flower], new)
     cluster, cluster_probability = _clusters(session, match, flower, probability, pose_probability)
     return Identities(cluster, cluster_probability, flower, np.clip(probability, 0.0, 1.0))
+
+
+def _with_their_clusters(match: Found, flower: IntArray) -> None:
+    """Flowers of clusters that were matched as a whole, although none of them would have been by itself."""
+    scene, found = match.scene, match.best
+    taken = np.zeros(len(match.plant.flowers), dtype=bool)
+    taken[flower[flower >= 0]] = True
+    for k in range(len(found)):
+        member = np.flatnonzero(found.partner[k] >= 0)
+        mine = scene.query.flower[found.query[k], member]
+        theirs = scene.known.flower[found.known[k], found.partner[k, member]]
+        if (flower[mine] < 0).all() and not taken[theirs].any():
+            flower[mine] = theirs
+            taken[theirs] = True
 
 
 def _flower_ratios(session: Constellation, match: Found) -> Array:

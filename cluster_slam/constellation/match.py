@@ -20,6 +20,7 @@ from cluster_slam.records import Constellation, PlantMap
 
 SINGLES_UP_TO = 80  # flowers on each side that are also matched one by one
 N_REFINED = 6
+MAX_PRIOR = 3.0  # log odds that a cluster is known because the others are: at most so much
 GLANCE_SEEDS, GLANCE_POSES = 10, 300  # of a glance
 LOOKS = 4000  # clusters that are looked at closely, over all poses: large plants need fewer poses to tell
 REPEATED_SHARE = 0.7  # of the centres: a second pose that puts so many on others means a repeated structure
@@ -267,10 +268,22 @@ def _drifted(plant: PlantMap, days: float) -> float:
     return plant.drift_rate**2 * days**2 / 3.0 + plant.walk_rate**2 * abs(days)
 
 
+def _with_prior(scene: Scene, found: Explained) -> tuple[Scene, Explained]:
+    """The explanation again, now that the others say how many of the session's clusters the plant has.
+
+    With m matched and u left over, the odds that one more is known are (m + 1) / (u + 1).
+    """
+    odds = np.log((len(found) + 1.0) / (len(scene.query) - len(found) + 1.0))
+    scene = replace(scene, bonus=scene.bonus - np.clip(odds, 0.0, MAX_PRIOR))
+    return scene, explain(scene, found.pose)[0]
+
+
 def _found(session: Constellation, alive: PlantMap, best: _Candidate, similarity: bool) -> Found | None:
     scene, found = best.scene, best.found
     if best.single:
         scene, found = warped(scene, found)
+    else:
+        scene, found = _with_prior(scene, found)
     if len(found) < best.space.d:
         return None
     pose, scale = found.pose, float(found.pose.scale[0])
