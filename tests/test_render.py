@@ -179,7 +179,7 @@ def test_a_rendered_session_on_disk(tmp_path: Path) -> None:
 
 
 def test_our_detector_finds_what_is_rendered(pictures: list[Picture]) -> None:
-    """Small as a file; of flowers that are wholly seen and 10 pixels wide it finds most, within a fifth of their width."""
+    """A small file; of flowers wholly seen and 10 pixels wide it finds most, within a fifth of their width."""
     from cluster_slam.detect import open_detector
     from cluster_slam.detect.onnx import own_model
 

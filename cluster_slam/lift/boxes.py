@@ -90,8 +90,9 @@ def lift_boxes(
 def _reaching(table: Array, k: int) -> Array:
     """The boxes (m, 4) that touch box k."""
     away = np.abs(table[:, :2] - table[k, :2])
-    touches: BoolArray = (away < (table[:, 2:] + table[k, 2:]) / 2 + table[k, 2:] / 2).all(1)
-    return table[touches & (np.arange(len(table)) != k)]
+    touches = np.logical_and.reduce(away < (table[:, 2:] + table[k, 2:]) / 2 + table[k, 2:] / 2, axis=1)
+    others: Array = table[touches & (np.arange(len(table)) != k)]
+    return others
 
 
 def _are_alike(widths: Array) -> BoolArray:
