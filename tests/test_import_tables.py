@@ -309,6 +309,20 @@ def test_a_mat_file_that_is_cut_off(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert len(error.splitlines()) == 1
 
 
+@pytest.mark.parametrize("at", [0, 100, 130, 140, 180, -20])
+def test_a_mat_file_that_is_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str], at: int) -> None:
+    """Zeros somewhere in a compressed file: refused in one line, or read where they did no harm."""
+    path = tmp_path / "p.mat"
+    savemat(path, {"flowers": cell(POINTS)}, do_compression=True)
+    data = bytearray(path.read_bytes())
+    at %= len(data)
+    data[at : at + 15] = b"\0" * 15
+    path.write_bytes(bytes(data))
+    code = run(["import", str(path), "-o", str(tmp_path / "s"), "--quiet"])
+    assert code == (0 if at == 100 else 2)
+    assert len(capsys.readouterr().err.splitlines()) == (0 if code == 0 else 1)
+
+
 def test_mat_files_without_positions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     savemat(tmp_path / "p.mat", {"name": "x", "gain": 3.0})
     assert run(["import", str(tmp_path / "p.mat"), "-o", str(tmp_path / "s")]) == 2

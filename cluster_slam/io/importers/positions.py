@@ -184,7 +184,10 @@ def _mat(path: Path, options: ImportOptions) -> tuple[Positions, list[Stream], s
     chosen = choose(path, "variable", options.flowers, names, sorted(usable, key=lambda n: -np.size(content[n])))
     found = None if chosen is None else _as_positions(path, chosen, content[chosen])
     if chosen is None or found is None:
-        listed = ", ".join(f"{name} {np.shape(content[name])}" for name in names) or "nothing"
+        listed = (
+            ", ".join(f"{name if name.isidentifier() else shown(name)} {np.shape(content[name])}" for name in names)
+            or "nothing"
+        )
         raise InputError(f"{path}: no positions per frame in {chosen or listed}, expected a cell or array of x y z")
     n = int(found.frame.max(initial=-1)) + 1
     times = next((t for t in (_as_times(content[k], n) for k in names if k != chosen) if t is not None), found.times)
@@ -200,7 +203,6 @@ def _stream(name: str, value: Any, role: str) -> Stream:
 
 def _load(path: Path) -> dict[str, Any]:
     from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
 
     try:
         content: dict[str, Any] = loadmat(path, squeeze_me=False, struct_as_record=True)
@@ -208,7 +210,7 @@ def _load(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: missing, expected a MATLAB file") from None
     except NotImplementedError:
         raise InputError(f"{path}: a MATLAB file of version 7.3 (HDF5), expected save(..., '-v7')") from None
-    except (ValueError, TypeError, OSError, EOFError, KeyError, IndexError, MatReadError, MemoryError) as error:
+    except Exception as error:  # of zlib, struct, NumPy or SciPy: whatever the damage leads to
         what = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: cannot be read as a MATLAB file ({what}); is it cut off?") from None
     return content

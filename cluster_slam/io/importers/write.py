@@ -162,6 +162,7 @@ class _PictureCheck:
         import cv2
 
         where = f"{'depth' if self._is_depth else 'colour'} image at {picture.stamp:.6f} s"
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what is broken is told by us
         data = np.frombuffer(picture.data, np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
         if image is None:
