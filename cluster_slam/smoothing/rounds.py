@@ -133,7 +133,7 @@ def regroup(frames: Frames, world: World, estimate: Estimate, config: SmoothConf
 def same_groups(a: World, b: World) -> bool:
     """Whether two worlds with the same flowers have the same clusters, whatever their numbers."""
     both = np.unique(np.stack([a.cluster, b.cluster]), axis=1).shape[1]
-    return both == len(np.unique(a.cluster)) == len(np.unique(b.cluster))
+    return bool(both == len(np.unique(a.cluster)) == len(np.unique(b.cluster)))
 
 
 def settle(frames: Frames, world: World, smoother: BatchSmoother, estimate: Estimate) -> World:
