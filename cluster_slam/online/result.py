@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 import numpy as np
 
 from cluster_slam.association.frames import sort_by_frame
-from cluster_slam.geometry import Array, pose_from_tum
+from cluster_slam.geometry import pose_from_tum
 from cluster_slam.landmark_tables import RestMap, cluster_table, flower_table
 from cluster_slam.online.journal import Told
 from cluster_slam.online.tracker import OnlineTracker
@@ -26,7 +26,8 @@ def make_result(session: Session, tracker: OnlineTracker, told: Told, timings: d
     flower_ids[order], cluster_ids[order] = told.rows["flower"], told.rows["cluster"]
     reasons[order], nis[order] = told.rows["reason"], told.rows["nis"]
     flowers, clusters = _tables(session, tracker, flower_ids)
-    warnings = (*session.warnings, *_shortcomings(flower_ids), *(text.partition(" ")[2] for text in told.warnings))
+    poor = _shortcomings(flower_ids, len(flowers))
+    warnings = (*session.warnings, *poor, *(text.partition(" ")[2] for text in told.warnings))
     return Result(
         session=session,
         T_world_camera=pose_from_tum(told.frames["pose"].astype(np.float64)),
@@ -58,7 +59,7 @@ def make_result(session: Session, tracker: OnlineTracker, told: Told, timings: d
         },
         warnings=tuple(dict.fromkeys(warnings)),
         merged=tuple(tracker.world.merged),
-        status="poor" if _shortcomings(flower_ids) else "ok",
+        status="poor" if poor else "ok",
     )
 
 
@@ -111,11 +112,11 @@ def _calibration(tracker: OnlineTracker) -> Calibration | None:
     return None if tracker.X is None else Calibration(tracker.X, tracker.cov_X)
 
 
-def _shortcomings(flower_ids: Array | IntArray) -> tuple[str, ...]:
+def _shortcomings(flower_ids: IntArray, n_flowers: int) -> tuple[str, ...]:
     if len(flower_ids) == 0:
         return ("no flowers in the session: there is nothing to follow",)
     share = float((flower_ids >= 0).mean())
-    if share == 0.0:
+    if share == 0.0 or n_flowers == 0:
         return (f"none of the {len(flower_ids)} observations was seen again: no flower could be confirmed",)
     if share < 0.5:
         return (f"only {100 * share:.0f} % of the observations belong to a flower: the rest was taken for false ones",)
