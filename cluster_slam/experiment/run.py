@@ -130,7 +130,7 @@ def _on_cluster(cells: list[Cell], address: str) -> Iterator[tuple[Cell, Figures
         client = Client(address, timeout="10s", set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(f"no scheduler at {address!r} ({error}), expected tcp://HOST:PORT") from None
-    with client:
+    with client, client.as_current():
         futures = client.map(run_cell, cells, pure=False)
         by_key = {future.key: cell for future, cell in zip(futures, cells, strict=True)}
         for future in completed(futures):

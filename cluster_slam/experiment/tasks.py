@@ -24,7 +24,8 @@ def run_cell(cell: Cell) -> Figures:
         figures = _TASKS[cell.task](resolve(cell), cell.seed)
     except ClusterSlamError:
         figures = {"failed": 1.0}
-    return {**figures, "seconds": process_time() - begin}
+    known = {name: value for name, value in figures.items() if np.isfinite(value)}
+    return {**known, "seconds": process_time() - begin}
 
 
 def _localise(options: Resolved, seed: int) -> Figures:

@@ -75,6 +75,8 @@ def calibrate(
     """
     _check(session)
     say = progress or (lambda _stage, _fraction: None)
+    if (_excitation(session) < _STILL_RAD).all():
+        return _unmoved(session, time_offset, depth_scale)
     say("who is who", 0.0)
     result = smooth(session, seed=seed, progress=lambda stage, share: say(stage, 0.45 * share))
     seen, mounting = _refined(session, result, time_offset, depth_scale)
@@ -205,8 +207,7 @@ def report_on(
     with_scale: bool,
 ) -> CalibrationReport:
     """What was found with what it is worth, and advice."""
-    turns = so3_log(inverse(session.poses[:1])[:, :3, :3] @ session.poses[:, :3, :3])
-    excitation = np.sqrt((turns - turns.mean(0)).var(0))
+    excitation = _excitation(session)
     advice = _advice(mounting.cov[:6, :6], excitation)
     prior = pose_model(session).cov_hand_eye
     learnt = np.trace(mounting.cov[:6, :6] @ np.linalg.solve(prior, np.eye(6))) / 6.0
@@ -229,6 +230,26 @@ def report_on(
         tuple(warnings),
         status,
     )
+
+
+def _excitation(session: Session) -> Array:
+    """Root mean square turn (3,) about each axis of the flange, rad."""
+    turns = so3_log(inverse(session.poses[:1])[:, :3, :3] @ session.poses[:, :3, :3])
+    out: Array = turns.std(0)
+    return out
+
+
+def _unmoved(session: Session, with_time: bool, with_scale: bool) -> CalibrationReport:
+    """Nothing to learn from an arm that did not turn: what was measured before stays."""
+    model = pose_model(session)
+    if model.X0 is None:
+        raise InputError(f"session {session.id!r} has no hand-eye transform to begin with")
+    sigma = [TIME_SIGMA_S] * with_time + [SCALE_SIGMA] * with_scale
+    cov = np.zeros((6 + len(sigma), 6 + len(sigma)))
+    cov[:6, :6] = model.cov_hand_eye
+    cov[range(6, len(cov)), range(6, len(cov))] = np.square(sigma)
+    unobserved = ("all: the arm did not turn",)
+    return report_on(session, Mounting(model.X0, 0.0, 1.0, cov, 0.0), 0, unobserved, "flowers", with_time, with_scale)
 
 
 def _advice(cov: Array, excitation: Array) -> tuple[str, ...]:
