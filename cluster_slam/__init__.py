@@ -14,19 +14,33 @@ if TYPE_CHECKING:
     from cluster_slam.evaluation import evaluate
     from cluster_slam.io.session import open_session
     from cluster_slam.online import OnlineTracker
+    from cluster_slam.pipeline.calibrate import calibrate
+    from cluster_slam.pipeline.localise import localise
     from cluster_slam.pipeline.smooth import smooth
     from cluster_slam.pipeline.track import track
     from cluster_slam.simulate import simulate
 
 _PUBLIC = {
     "OnlineTracker": "cluster_slam.online",
+    "calibrate": "cluster_slam.pipeline.calibrate",
     "evaluate": "cluster_slam.evaluation",
+    "localise": "cluster_slam.pipeline.localise",
     "open_session": "cluster_slam.io.session",
     "simulate": "cluster_slam.simulate",
     "smooth": "cluster_slam.pipeline.smooth",
     "track": "cluster_slam.pipeline.track",
 }
-__all__ = ["OnlineTracker", "__version__", "evaluate", "open_session", "simulate", "smooth", "track"]
+__all__ = [
+    "OnlineTracker",
+    "__version__",
+    "calibrate",
+    "evaluate",
+    "localise",
+    "open_session",
+    "simulate",
+    "smooth",
+    "track",
+]
 
 
 def __getattr__(name: str) -> Any:
