@@ -200,6 +200,16 @@ def test_match_ranks_and_changes_nothing(tmp_path: Path) -> None:
         assert dump(store) == before
 
 
+def test_a_refusal_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with map_of(tmp_path, grown()) as store:
+        before = dump(store)
+        result = result_of(tmp_path / "other", grown(9))
+        assert run(["map", "add", str(store.path), str(result), "--quiet"]) == 1
+        assert "refused, the map is unchanged: no match" in capsys.readouterr().err
+        assert json.loads((result / "run.json").read_text())["aligned"] is False
+        assert dump(store) == before
+
+
 def test_export(tmp_path: Path) -> None:
     plant = grown()
     with map_of(tmp_path, plant) as store:

@@ -83,7 +83,7 @@ def add(
     Example: cluster-slam map add field.map out/monday
     """
     from cluster_slam.io.map import open_map
-    from cluster_slam.io.map.complete import check_result, complete_result
+    from cluster_slam.io.map.complete import check_result, complete_result, replace_files
     from cluster_slam.pipeline.remember import add as add_session
 
     options = configured(MapConfig(), config, settings or [])
@@ -109,6 +109,8 @@ def add(
         )
         if added.session is not None and result is not None:
             complete_result(result, store, added.session)
+        elif result is not None:
+            replace_files(result, {}, {"aligned": False})
     if as_json:
         print_json(_added_json(added))
     elif not quiet:
