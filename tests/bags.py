@@ -75,7 +75,8 @@ class BagWriter:
 
     def pose(self, row: np.ndarray) -> Any:
         point = self.make("geometry_msgs/msg/Point", *map(float, row[:3]))
-        return self.make("geometry_msgs/msg/Pose", point, self.make("geometry_msgs/msg/Quaternion", *map(float, row[3:])))
+        turn = self.make("geometry_msgs/msg/Quaternion", *map(float, row[3:]))
+        return self.make("geometry_msgs/msg/Pose", point, turn)
 
     def transforms(self, topic: str, ns: int, *edges: tuple[str, str, np.ndarray], arrival: int | None = None) -> None:
         found = []
@@ -83,9 +84,7 @@ class BagWriter:
             t = self.make("geometry_msgs/msg/Vector3", *map(float, row[:3]))
             q = self.make("geometry_msgs/msg/Quaternion", *map(float, row[3:]))
             transform = self.make("geometry_msgs/msg/Transform", t, q)
-            found.append(
-                self.make("geometry_msgs/msg/TransformStamped", self.header(ns, parent), child, transform)
-            )
+            found.append(self.make("geometry_msgs/msg/TransformStamped", self.header(ns, parent), child, transform))
         self.write(topic, arrival or ns, self.make("tf2_msgs/msg/TFMessage", found))
 
 
