@@ -121,8 +121,7 @@ class IncrementalMap:
     def __getstate__(self) -> dict[str, Any]:
         """Written down without what follows from the rest: factors of frames, and room to grow."""
         H, g = self.information
-        state = dict(self.__dict__, _H=H.copy(), _g=g.copy(), recent=[m for m, _ in self.recent])
-        return state
+        return dict(self.__dict__, _H=H.copy(), _g=g.copy(), recent=[m for m, _ in self.recent])
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state, recent=deque((m, eliminate(m)) for m in state["recent"]))
