@@ -46,7 +46,7 @@ def test_what_all_clusters_do_is_the_cameras_error() -> None:
 def test_what_stands_still_is_all_but_still() -> None:
     rng = np.random.default_rng(2)
     d, cov, frame, cluster = measured(np.zeros((len(STAMPS), 12, 3)), rng=rng)
-    assert rest_sigma(d, cov, np.zeros(len(d)), frame, cluster, STAMPS) < 0.1 * NOISE_M
+    assert rest_sigma(d, cov, np.zeros(len(d)), frame, cluster, STAMPS) < 0.15 * NOISE_M
 
 
 @pytest.mark.parametrize("hz", [0.5, 1.0, 3.0])

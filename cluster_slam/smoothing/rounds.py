@@ -24,7 +24,7 @@ from cluster_slam.graph.batch import BatchSmoother, Estimate, Pairs, PoseModel
 from cluster_slam.graph.noise import camera_covs
 from cluster_slam.graph.variance import errs_slowly
 from cluster_slam.grouping import Motion, group_flowers
-from cluster_slam.smoothing.stretches import quarter_period, rest_sigma, stretches
+from cluster_slam.smoothing.stretches import quarter_period, rest_sigma, standing_still, stretches
 from cluster_slam.smoothing.world import NO_WEIGHT, World, fewest_observations, scalar_var
 from tracking.gating import chi2_threshold
 
@@ -79,9 +79,11 @@ def problem(
     lever_sq = float(np.median((frames.points**2).sum(axis=1))) if len(frames) else 0.0
     pose_var = model.cov[3, 3] + model.cov[0, 0] * lever_sq
     scale = motion_scale(d, cov + pose_var * np.eye(3), frame, cluster, frames.stamps)
-    if np.bincount(world.cluster, minlength=1).max(initial=0) < 2:
+    alone = np.bincount(world.cluster, minlength=1).max(initial=0) < 2
+    if alone:
         scale = np.zeros_like(scale)  # flowers that stand alone tell no sway from errors of their own
-    sigma = np.hypot(scale, rest_sigma(d, cov, scale, frame, cluster, frames.stamps))
+    rest = standing_still(cov) if alone else rest_sigma(d, cov, scale, frame, cluster, frames.stamps)
+    sigma = np.hypot(scale, rest)
     stretch, stretch_sigma = np.full(len(frame), -1), np.empty(0)
     if in_stretches:
         length = quarter_period(d, scale, frame, cluster, frames.stamps)

@@ -16,7 +16,7 @@ from cluster_slam.records import IntArray
 _LAGS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 21, 26, 34, 42, 55, 68, 89, 110, 144)
 _WITHIN = 0.5  # of a stretch's sigma: how far a displacement strays from the stretch's mean, a quarter of a sine
 _FEWEST = 30  # products that make a covariance
-_CALM_SHARE = 0.02  # of the measurement's sigma: no cluster is known to stand stiller
+_CALM_SHARE = 0.1  # of the measurement's sigma: no cluster is known to stand stiller
 
 
 class Series:
@@ -41,7 +41,7 @@ class Series:
         seen_early, seen_late = self.seen[:-lag], self.seen[lag:]
         n_both = float((seen_early.sum(axis=1) * seen_late.sum(axis=1)).sum()) - count
         both = float((early.sum(axis=1) * late.sum(axis=1)).sum()) - 3.0 * count * value
-        common = both / (3.0 * n_both) if n_both >= _FEWEST else 0.0
+        common = both / (3.0 * n_both) if n_both >= _FEWEST else value  # one cluster alone cannot tell
         return value - max(common, 0.0), count
 
     def covariance(self, lag: int) -> tuple[float, float]:
@@ -52,6 +52,11 @@ class Series:
         return float((self.values[lag:] * self.values[:-lag]).sum()) / max(3.0 * count, 1.0), count
 
 
+def standing_still(cov: Array) -> float:
+    """The least that clusters move, m, beside the noise (p, 3, 3) of their measurements."""
+    return _CALM_SHARE * float(np.sqrt(np.median(np.trace(cov, axis1=1, axis2=2)) / 3.0)) if len(cov) else 1e-4
+
+
 def rest_sigma(d: Array, cov: Array, scale: Array, frame: IntArray, cluster: IntArray, stamps: Array) -> float:
     """How far clusters that are not known to move are from rest, m, one sigma along any axis.
 
@@ -60,17 +65,17 @@ def rest_sigma(d: Array, cov: Array, scale: Array, frame: IntArray, cluster: Int
     """
     calm = scale <= 0.0
     if not calm.any():
-        return float(np.sqrt(np.trace(cov, axis1=1, axis2=2).mean() / 3.0)) if len(cov) else 1e-4
-    noise = float(np.sqrt(np.median(np.trace(cov[calm], axis1=1, axis2=2)) / 3.0))
+        return standing_still(cov)
+    least = standing_still(cov[calm])
     # Squares of rare mistakes would be all that is seen.
     size = (d[calm] ** 2).sum(axis=1)
     usual = np.flatnonzero(calm)[size <= 16.0 * np.trace(cov[calm], axis1=1, axis2=2)]
     series = Series(d[usual], frame[usual], cluster[usual], stamps)
     (first, n_first), (second, n_second) = series.own_covariance(1), series.own_covariance(2)
     if n_first + n_second < _FEWEST:
-        return 0.3 * noise
+        return least
     shared = (first * n_first + second * n_second) / (n_first + n_second)
-    return float(np.sqrt(max(shared, (_CALM_SHARE * noise) ** 2)))
+    return float(np.sqrt(max(shared, least**2)))
 
 
 def quarter_period(d: Array, scale: Array, frame: IntArray, cluster: IntArray, stamps: Array) -> float:
