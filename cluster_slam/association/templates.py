@@ -101,6 +101,7 @@ class Follower:
         self.log_clutter = float(np.log(clutter_density))
         self.places, self.cluster = places, cluster
         self.n_clusters = int(cluster.max(initial=-1)) + 1
+        self.stand_alone = self.n_clusters == len(places)
         self.cov_pose = cov_pose
         self.information_pose = np.linalg.inv(cov_pose + 1e-18 * np.eye(6))
         self.low, self.high = field_of_view(frames)
@@ -152,6 +153,8 @@ class Follower:
         is so wide that any false detection fits it.
         """
         s, cfg = self.springs, self.config
+        if self.stand_alone:  # no cluster of two: then wandering detections are errors of a detector, not sway
+            return np.ones(len(flowers), dtype=bool)
         owner = self.cluster[flowers]
         offset = w - self.places[flowers]
         rest, _ = chi2_and_log_det(offset, S + REST_SIGMA_M**2 * np.eye(3))

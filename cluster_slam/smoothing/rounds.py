@@ -43,11 +43,12 @@ def associate(frames: Frames, model: PoseModel, world: World, config: SmoothConf
     landmark[back.order] = backward.landmark
     backward = replace(backward, landmark=landmark, score=backward.score[::-1])
     landmark = combine_directions(forward, backward, frames, world.cluster)
-    agree = forward.landmark == backward.landmark
-    alone = without_support(
-        frames, world.T, world.places, world.cluster, landmark, agree, REST_SIGMA_M, config.follow.gate_chi2
-    )
-    landmark = np.where(alone, -1, landmark)
+    if len(np.unique(world.cluster)) < len(world.places):
+        agree = forward.landmark == backward.landmark
+        alone = without_support(
+            frames, world.T, world.places, world.cluster, landmark, agree, REST_SIGMA_M, config.follow.gate_chi2
+        )
+        landmark = np.where(alone, -1, landmark)
     keep = np.bincount(landmark[landmark >= 0], minlength=len(world.places)) > 0
     _, cluster = np.unique(world.cluster[keep], return_inverse=True)
     return replace(world, landmark=compact(keep, landmark), places=world.places[keep], cluster=cluster)
