@@ -86,7 +86,7 @@ def test_what_does_not_fit_is_refused_with_numbers() -> None:
         ({"sway_m": -0.1}, "sway_m must be a number from 0"),
         ({"duration_s": float("nan")}, "duration_s must be a number from 0"),
         ({"pose_frame": "T_world_gripper"}, "pose_frame must be one of"),
-        ({"level": 1}, "level must be one of"),
+        ({"level": 4}, "level must be one of"),
         ({"n_clusters": 0}, "n_clusters must be greater than 0"),
     ],
 )
