@@ -80,6 +80,18 @@ def test_improving_never_makes_it_less_likely() -> None:
     assert likelihood(improve(start, likelihood)) >= likelihood(start)
 
 
+def test_evidence_of_few_pairs_is_not_diluted_by_the_other_members() -> None:
+    """One known pair in a cluster of four counts as much as in a cluster of two: else it would pay to split."""
+    places = np.array([[0.0, 0, 1], [0.02, 0, 1], [0.0, 0.02, 1], [0.02, 0.02, 1]])
+    evidence = np.zeros((4, 4))
+    evidence[0, 1] = evidence[1, 0] = 3.0
+    known, unknown = (Likelihood(places, 0.5, 0.02, e) for e in (csr_matrix(evidence), None))
+    for label in (np.array([0, 0, 0, 0]), np.array([0, 0, 1, 1])):
+        assert known(label) - unknown(label) == pytest.approx(3.0)
+    full = Likelihood(places, 0.5, 0.02, csr_matrix(3.0 * (1.0 - np.eye(4))))
+    assert full(np.zeros(4)) - unknown(np.zeros(4)) == pytest.approx(9.0)  # six pairs, three of them new
+
+
 def test_likelihood_does_not_depend_on_names() -> None:
     rng = np.random.default_rng(13)
     places = rng.uniform(0, 0.4, (12, 3))

@@ -27,6 +27,7 @@ _SIGNIFICANT = 11.3  # chi-square, 3 degrees of freedom, 99 %
 _FEWEST_FRAMES = 5
 _SYSTEMATIC = 0.02  # of an observation's variance: how well places at rest are known, which does not average out
 _SURE = 0.33  # motion of three times its own standard deviation is there at all
+_WRONG = 0.03  # of the frames of a pair: those with the largest differences are left out
 _APART = (0.95, 0.35)  # ratio of flowers of two clusters, mean and sigma ...
 _ANYTHING = 0.05  # ... and this share of all pairs has any ratio
 _RANGE = 1.4
@@ -97,6 +98,9 @@ def _ratios(pairs: NDArray[Any], motion: Motion) -> tuple[Array, Array]:
         noise = motion.var[k, f] + motion.var[k, g]
         weight = signal[k] / (signal[k] + noise) / noise
         u_f, u_g = motion.u[k, f], motion.u[k, g]
+        difference = weight * ((u_f - u_g) ** 2).sum(-1)
+        # A single wrong observation must not part a cluster.
+        weight[np.argsort(difference)[-max(1, round(_WRONG * len(k))) :]] = 0.0
         bias = 3.0 * float((weight * noise).sum())
         apart = float((weight * ((u_f - u_g) ** 2).sum(-1)).sum()) - bias
         total = float((weight * ((u_f**2).sum(-1) + (u_g**2).sum(-1))).sum()) - bias

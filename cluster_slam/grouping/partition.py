@@ -2,7 +2,7 @@
 
 Clusters stand anywhere in the space that was looked at; members scatter about their centroid with one sigma for all
 clusters; the number of members is Poisson, and some flowers are loose. To this comes the evidence of each pair within a
-cluster; of the pairs among n members only n - 1 say something new, so each counts 2 / n.
+cluster; of the pairs among n members at most n - 1 say something new, so that they weigh no more than that together.
 """
 
 from __future__ import annotations
@@ -60,7 +60,10 @@ class Likelihood:
 
     def _motion(self, label: IntArray, size: IntArray) -> float:
         within = label[self.row] == label[self.col]
-        return float((self.evidence[within] * 2.0 / size[label[self.row[within]]]).sum())
+        of = label[self.row[within]]
+        n_pairs = np.bincount(of, minlength=len(size))
+        weight = np.minimum(1.0, (size - 1.0) / np.maximum(n_pairs, 1))
+        return float((self.evidence[within] * weight[of]).sum())
 
 
 def _log_sizes(size: IntArray) -> float:

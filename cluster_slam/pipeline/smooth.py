@@ -63,12 +63,14 @@ def smooth(
     say("smoothing all", 0.85)
     frames, model = for_solving(stated, stated_poses, world)
     smoother, estimate = solve(frames, model, world, config, 4)
+    before = world.landmark
     if world.cov_step is None and not world.errs_slowly:
         world = settle(frames, world, smoother, estimate)
+    claimed = world.landmark != before
     world = learn(world, smoother, estimate)
     drifts = world.cov_step is not None
     for i in range(config.max_rounds):
-        grouped = world if drifts else regroup(frames, world, estimate, config, rng)
+        grouped = world if drifts else regroup(frames, world, config, rng, claimed)
         if i > 0 and same_groups(world, grouped):
             break
         world = grouped
@@ -110,7 +112,7 @@ def _associate_and_smooth(
             world = replace(world, errs_slowly=observations_err_slowly(frames, model, world))
         smoother, estimate = solve(frames, model, world, config, 2)
         world = learn(world, smoother, estimate)
-        world = regroup(frames, world, estimate, config, rng)
+        world = regroup(frames, world, config, rng)
         clock.lap("smoothing")
         if is_last:
             break

@@ -24,6 +24,7 @@ from cluster_slam.graph.batch import BatchSmoother, Estimate, Pairs, PoseModel
 from cluster_slam.graph.noise import camera_covs
 from cluster_slam.graph.variance import errs_slowly
 from cluster_slam.grouping import Motion, group_flowers
+from cluster_slam.records import BoolArray
 from cluster_slam.smoothing.stretches import quarter_period, rest_sigma, standing_still, stretches
 from cluster_slam.smoothing.world import NO_WEIGHT, World, fewest_observations, scalar_var
 from tracking.gating import chi2_threshold
@@ -112,14 +113,13 @@ def observations_err_slowly(frames: Frames, model: PoseModel, world: World) -> b
     return errs_slowly(smoother, replace(start, d=np.zeros_like(start.d)))
 
 
-def regroup(frames: Frames, world: World, estimate: Estimate, config: SmoothConfig, rng: np.random.Generator) -> World:
-    """Group the flowers again, now that it is known how each moved.
-
-    What was claimed only since the estimate was made has no say; outliers have, for in a wrong group all are outliers.
-    """
+def regroup(
+    frames: Frames, world: World, config: SmoothConfig, rng: np.random.Generator, claimed: BoolArray | None = None
+) -> World:
+    """Group the flowers again, now that it is known how each moved; wild observations (m,) have no say in that."""
     n = len(world.places)
     presence = presence_of(frames.frame, world.landmark, n, frames.n_frames)
-    used = (world.landmark >= 0) & np.isfinite(estimate.residual_chi2)
+    used = (world.landmark >= 0) if claimed is None else (world.landmark >= 0) & ~claimed
     u = np.full((frames.n_frames, n, 3), np.nan)
     var = np.full((frames.n_frames, n), np.nan)
     at = (frames.frame[used], world.landmark[used])
