@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +11,11 @@ import pytest
 from folders import TOML, write_folder
 from result_format import check_result_folder
 
+from cluster_slam import smooth
 from cluster_slam.cli.app import run
+from cluster_slam.errors import EstimationError
 from cluster_slam.geometry import Array
+from cluster_slam.simulate import PRESETS, simulate_session
 
 N_FRAMES = 40
 KINDS = {
@@ -106,3 +109,22 @@ def test_the_order_of_the_rows_does_not_matter(tmp_path: Path, kind: str) -> Non
         ids.append([line.split(",")[1] for line in lines])
     pairs = set(zip(ids[0], reversed(ids[1]), strict=True))
     assert len(pairs) == len(set(ids[0]))
+
+
+def test_copies_of_one_frame_end_in_a_word() -> None:
+    """An arm that stands still and points that repeat to the last digit: nothing has an error to be estimated from."""
+    session = simulate_session(PRESETS["sample"], seed=3).session
+    given = session.observations
+    first, n = given.frame == 0, 60
+    copies = replace(
+        given,
+        frame=np.repeat(np.arange(n), int(first.sum())),
+        points=np.tile(given.points[first], (n, 1)),
+        covs=np.tile(given.covs[first], (n, 1, 1)),
+        scores=np.tile(given.scores[first], n),
+    )
+    still = replace(
+        session, stamps=session.stamps[:n], poses=np.tile(session.poses[:1], (n, 1, 1)), observations=copies
+    )
+    with pytest.raises(EstimationError, match="do not determine"):
+        smooth(still)

@@ -20,6 +20,7 @@ import gtsam
 import numpy as np
 
 from cluster_slam.association.frames import Frames
+from cluster_slam.errors import EstimationError
 from cluster_slam.geometry import Array, adjoint, inverse, se3_exp, se3_log, skew
 from cluster_slam.records import IntArray
 
@@ -226,7 +227,13 @@ class BatchSmoother:
 
     def step(self, e: Estimate) -> tuple[Estimate, float]:
         """One Gauss-Newton step and the size of the largest change of a place, m."""
-        delta = self.graph(e).optimize(self._ordering())
+        try:
+            delta = self.graph(e).optimize(self._ordering())
+        except RuntimeError as error:  # GTSAM's word for it is no answer to a person
+            raise EstimationError(
+                f"the {len(self.rows)} observations of {self.n_places} flowers do not determine its poses and "
+                "places in numbers: are they copies of each other, or their covariances far from their errors?"
+            ) from error
         keys = self.keys
         n, p, s = len(e.T), len(e.d), len(self.pairs.stretch_sigma)
         z = np.array([delta.at(keys.z + i) for i in range(n)])
