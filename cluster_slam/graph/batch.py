@@ -14,6 +14,7 @@ Perception", RA-L 2020, eq. 14 and remark 5).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -86,7 +87,7 @@ class Marginals:
 
 
 class _Keys:
-    """Integer keys of the unknowns, in the order of elimination: d, z, b, l, x."""
+    """Integer keys of the unknowns, in the order of elimination, but for b between the z's: d, z, b, l, x."""
 
     def __init__(self, n_pairs: int, n_frames: int, n_stretches: int, n_places: int) -> None:
         ends = np.cumsum([n_pairs, n_frames, n_stretches, n_places, 1])
@@ -249,11 +250,17 @@ class BatchSmoother:
         return replace(moved, residual_chi2=chi2), float(np.abs(places).max(initial=0.0))
 
     def _ordering(self) -> gtsam.Ordering:
-        ordering = gtsam.Ordering()
         last = self.keys.x + (0 if self.poses.X0 is None else 1)
-        for key in range(last):
-            ordering.push_back(key)
-        return ordering
+        return _in_order([*self._of_frames(), *range(self.keys.l, last)])
+
+    def _of_frames(self) -> list[int]:
+        """Keys of what is eliminated before places: in time, so that odometry carries few stretches along."""
+        keys, pairs = self.keys, self.pairs
+        end = np.zeros(len(pairs.stretch_sigma))
+        within = pairs.stretch >= 0
+        np.maximum.at(end, pairs.stretch[within], pairs.frame[within] + 0.5)
+        time = np.concatenate([np.arange(keys.b - keys.z), end])
+        return [*range(keys.z), *(keys.z + np.argsort(time, kind="stable")).tolist()]
 
     def solve(self, e: Estimate, outlier_chi2: float, max_iterations: int = 8, tolerance_m: float = 2e-5) -> Estimate:
         """Gauss-Newton with truncated least squares at ``outlier_chi2`` (3 degrees of freedom), graduated.
@@ -272,14 +279,8 @@ class BatchSmoother:
 
     def marginals(self, e: Estimate) -> Marginals:
         """Joint covariance of places and hand-eye transform; all else is eliminated."""
-        first = gtsam.Ordering()
-        for key in range(self.keys.l):
-            first.push_back(key)
-        _, rest = self.graph(e).eliminatePartialMultifrontal(first)
-        last = gtsam.Ordering()
-        for key in range(self.keys.l, self.keys.x + (0 if e.X is None else 1)):
-            last.push_back(key)
-        H, _ = rest.hessian(last)
+        _, rest = self.graph(e).eliminatePartialMultifrontal(_in_order(self._of_frames()))
+        H, _ = rest.hessian(_in_order(range(self.keys.l, self.keys.x + (0 if e.X is None else 1))))
         H = 0.5 * (H + H.T)
         scale = 1.0 / np.sqrt(np.diag(H))
         L = np.linalg.cholesky(H * scale[:, None] * scale)
@@ -287,6 +288,13 @@ class BatchSmoother:
         cov = half.T @ half
         n = 3 * self.n_places
         return Marginals(cov[:n, :n], None if e.X is None else cov[n:, n:])
+
+
+def _in_order(keys: Iterable[int]) -> gtsam.Ordering:
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return ordering
 
 
 def _truncated_weights(chi2: Array, threshold: float, mu: float) -> Array:

@@ -87,7 +87,7 @@ def problem(
     rest = standing_still(cov) if alone else rest_sigma(d, cov, scale, frame, cluster, frames.stamps)
     sigma = np.hypot(scale, rest)
     stretch, stretch_sigma = np.full(len(frame), -1), np.empty(0)
-    if in_stretches:
+    if in_stretches and not alone:
         length = quarter_period(d, scale, frame, cluster, frames.stamps)
         stretch, stretch_sigma, sigma = stretches(d, cov, sigma, frame, cluster, frames.stamps, length)
     pairs = Pairs(of=of, frame=frame, cluster=cluster, sigma=sigma, stretch=stretch, stretch_sigma=stretch_sigma)
