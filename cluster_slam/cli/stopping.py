@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Callable
 from types import FrameType, TracebackType
 
 
 class Stopping:
     """A context in which the first signal is a request; the second is what it always was."""
 
-    def __init__(self) -> None:
+    def __init__(self, then: Callable[[], None] | None = None) -> None:
+        """``then`` is called with the request, by a run that may wait for long."""
         self.signal: int | None = None
+        self.then = then
         self._before: dict[int, object] = {}
 
     def __enter__(self) -> Stopping:
@@ -35,3 +38,5 @@ class Stopping:
         if self.signal is not None:
             raise KeyboardInterrupt
         self.signal = number
+        if self.then is not None:
+            self.then()

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shutil import rmtree
@@ -14,31 +13,59 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cluster_slam.cli.detect import DetectorOption, ModelOption, detector_for
 from cluster_slam.cli.options import (
     ConfigOption,
     JsonOption,
     QuietOption,
     SeedOption,
-    SessionArgument,
     SetOption,
     configured,
 )
 from cluster_slam.cli.progress import StageProgress
 from cluster_slam.cli.stopping import Stopping
 from cluster_slam.cli.summary import print_json, print_table, print_warnings, result_rows, truth_rows
-from cluster_slam.cli.track_view import TrackView
+from cluster_slam.cli.track_live import Listeners, LiveOptions, follow_robot
+from cluster_slam.errors import ConfigError
 
 if TYPE_CHECKING:
     from cluster_slam.config import OnlineConfig
-    from cluster_slam.online.records import Update
-    from cluster_slam.records import Calibration, Result, Session, Truth
+    from cluster_slam.evaluation import Metrics
+    from cluster_slam.io.observed import Detector
+    from cluster_slam.records import Result
 
 
 def command(
-    session: SessionArgument,
     out: Annotated[
         Path, typer.Option("--out", "-o", metavar="OUT", help="Result folder; an earlier result in it is replaced.")
     ],
+    session: Annotated[
+        Path | None, typer.Argument(metavar="[SESSION]", help="Session folder.", show_default=False)
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option("--robot", metavar="HOST", help="Follow this arm, live.", show_default=False)
+    ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option("--camera", metavar="CAMERA", help="On the arm: realsense, or a folder.", show_default=False),
+    ] = None,
+    hand_eye: Annotated[
+        str | None,
+        typer.Option(
+            "--hand-eye",
+            metavar="'TX TY TZ QX QY QZ QW'",
+            help="Camera on the TCP, measured.",
+            show_default=False,
+        ),
+    ] = None,
+    duration: Annotated[
+        float | None,
+        typer.Option("--duration", metavar="S", min=0, help="With --robot: end after so long.", show_default=False),
+    ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option("--record", metavar="SESSION", help="With --robot: keep what came in.", show_default=False),
+    ] = None,
     calibration: Annotated[
         Path | None,
         typer.Option("--calibration", metavar="FILE", help="calibration.toml as smooth writes it.", show_default=False),
@@ -53,37 +80,41 @@ def command(
     config: ConfigOption = None,
     settings: SetOption = None,
     level: Annotated[
-        int | None, typer.Option("--level", help="3 flowers, 2 detections; default: the highest.", show_default=False)
+        int | None,
+        typer.Option("--level", help="3 flowers, 2 detections, 1 pictures; default: the highest.", show_default=False),
     ] = None,
+    model: ModelOption = None,
+    detector: DetectorOption = None,
     seed: SeedOption = 0,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Follow the clusters of a session frame by frame, as if it were live.
+    """Follow the clusters of a session frame by frame, as if it were live, or those before a robot's camera.
 
     Each row of the result is what was known when its frame had just been processed; no later frame improves it.
-    Ctrl-C and SIGTERM stop after a frame: --resume goes on from there, with the same identities.
+    Ctrl-C and SIGTERM stop after a frame: a session goes on from there with --resume, with the same identities; a
+    live run ends in order, with its result. The arm is only listened to.
 
     Example: cluster-slam track data/sample -o out/track
+
+    Example: cluster-slam track --robot 192.168.1.10 --camera realsense --calibration calibration.toml -o out/live
     """
     from cluster_slam.config import OnlineConfig
-    from cluster_slam.errors import ConfigError
-    from cluster_slam.io.read_result import read_calibration
     from cluster_slam.io.result import check_output
-    from cluster_slam.io.session import open_session, open_truth
 
-    if stream == "-" and as_json:
-        raise ConfigError("--stream - and --json both want standard output, expected one of them")
+    live = LiveOptions(robot, camera, hand_eye, duration, record, calibration, model, detector)
+    _check(session, live, level, realtime, stream, as_json)
     check_output(out)
     options = configured(OnlineConfig(), config, settings or [])
-    known = None if calibration is None else read_calibration(calibration)
     started = perf_counter()
-    opened = open_session(session, level=level)
-    truth = open_truth(session, opened)
     is_shown = not (quiet or as_json or view)
-    work = _Work(out, options, known, seed, realtime, resume, stream, view)
+    how = _How(out, options, calibration, seed, realtime, resume, stream, view)
     with StageProgress(is_shown=is_shown) as progress, Stopping() as stopping:
-        result, numbers = work.run(opened, truth, progress, stopping)
+        if session is None:
+            result, numbers = how.follow(live, progress, stopping)
+        else:
+            finder = detector_for(session, level, model, detector)
+            result, numbers = how.replay(session, level, finder, progress, stopping)
     if as_json:
         print_json({**json.loads((out / "run.json").read_text("utf-8")), "metrics": numbers, "out": str(out)})
     elif not quiet and stream != "-":
@@ -93,74 +124,92 @@ def command(
     return 0 if result.status == "ok" else 1
 
 
+def _check(
+    session: Path | None, live: LiveOptions, level: int | None, realtime: bool, stream: str | None, as_json: bool
+) -> None:
+    """Refuse options that do not go together."""
+    if stream == "-" and as_json:
+        raise ConfigError("--stream - and --json both want standard output, expected one of them")
+    if (session is None) == (live.host is None):
+        raise ConfigError("expected a SESSION or --robot HOST, and not both")
+    if live.host is None:
+        live.check_unused()
+    else:
+        live.check()
+        if realtime or level is not None:
+            raise ConfigError("--realtime and --level are of a session, expected none with --robot")
+
+
 @dataclass(frozen=True, slots=True)
-class _Work:
-    """What the options ask for."""
+class _How:
+    """What the options ask for, whatever is followed."""
 
     out: Path
     options: OnlineConfig
-    calibration: Calibration | None
+    calibration: Path | None
     seed: int
     realtime: bool
     resume: bool
     stream: str | None
     view: bool
 
-    def run(
-        self, session: Session, truth: Truth | None, progress: StageProgress, stopping: Stopping
+    def replay(
+        self, folder: Path, level: int | None, finder: Detector | None, progress: StageProgress, stopping: Stopping
     ) -> tuple[Result, dict[str, float]]:
-        """Track, evaluate where there is truth, render the report, write all of it."""
+        """A session, as if live; evaluated where there is truth."""
         from cluster_slam.evaluation import evaluate
-        from cluster_slam.io.result import write_result
-        from cluster_slam.online.journal import journal_of
-        from cluster_slam.report.page import render_report
-
-        result = self._track(session, progress, stopping)
-        progress("evaluating", 0.95)
-        metrics = None if truth is None else evaluate(result, session, truth)
-        files: dict[str, str | bytes] = {"report.html": render_report(result, metrics)}
-        numbers = {} if metrics is None else metrics.as_json()
-        if metrics is not None:
-            files["metrics.json"] = json.dumps(numbers, indent=2, allow_nan=False) + "\n"
-        write_result(result, self.out, extra_files=files)
-        rmtree(journal_of(self.out), ignore_errors=True)
-        return result, numbers
-
-    def _track(self, session: Session, progress: StageProgress, stopping: Stopping) -> Result:
-        from cluster_slam.online.stream import open_stream
+        from cluster_slam.io.read_result import read_calibration
+        from cluster_slam.io.session import open_session, open_truth
         from cluster_slam.pipeline.track import StoppedError, track
 
-        with ExitStack() as stack:
-            listeners: list[Callable[[Update], None]] = []
-            lines = None if self.stream is None else open_stream(self.stream, patient=not self.realtime)
-            if lines is not None:
-                listeners.append(lines.put)
-            if self.view:
-                listeners.append(stack.enter_context(TrackView()).show)
-
-            def tell(update: Update) -> None:
-                for listen in listeners:
-                    listen(update)
-
-            try:
+        known = None if self.calibration is None else read_calibration(self.calibration)
+        session = open_session(folder, level=1 if finder else level, detector=finder, progress=progress)
+        truth = open_truth(folder, session)
+        try:
+            with Listeners(self.stream, self.view, patient=not self.realtime) as listeners:
                 result = track(
                     session,
-                    calibration=self.calibration,
+                    calibration=known,
                     config=self.options,
                     seed=self.seed,
                     realtime=self.realtime,
                     out=self.out,
                     resume=self.resume,
                     progress=progress,
-                    on_update=tell,
+                    on_update=listeners,
                     should_stop=stopping,
                 )
-            except StoppedError as stopped:
-                sys.stderr.write(f"cluster-slam: {stopped}\n")
-                raise SystemExit(128 + (stopping.signal or 0)) from None
-            finally:
-                lost = () if lines is None else lines.close()
-        return replace(result, warnings=(*result.warnings, *lost))
+        except StoppedError as stopped:
+            sys.stderr.write(f"cluster-slam: {stopped}\n")
+            raise SystemExit(128 + (stopping.signal or 0)) from None
+        progress("evaluating", 0.95)
+        result = replace(result, warnings=(*result.warnings, *listeners.lost))
+        metrics = None if truth is None else evaluate(result, session, truth)
+        self._write(result, metrics)
+        return result, {} if metrics is None else metrics.as_json()
+
+    def follow(self, live: LiveOptions, progress: StageProgress, stopping: Stopping) -> tuple[Result, dict[str, float]]:
+        """A robot's camera, until it ends or somebody wants to stop."""
+        with Listeners(self.stream, self.view, patient=False) as listeners:
+            result = follow_robot(live, self.out, self.options, self.seed, self.resume, listeners, progress, stopping)
+        result = replace(result, warnings=(*result.warnings, *listeners.lost))
+        self._write(result, None)
+        return result, {}
+
+    def _write(self, result: Result, metrics: Metrics | None) -> None:
+        from cluster_slam.io.result import write_result
+        from cluster_slam.io.session import OBSERVED
+        from cluster_slam.io.session_writer import observed_table
+        from cluster_slam.online.journal import journal_of
+        from cluster_slam.report.page import render_report
+
+        files: dict[str, str | bytes] = {"report.html": render_report(result, metrics)}
+        if metrics is not None:
+            files["metrics.json"] = json.dumps(metrics.as_json(), indent=2, allow_nan=False) + "\n"
+        if result.session.level == 1:  # what was detected, so that no picture need be opened again
+            files[OBSERVED] = observed_table(result.session)
+        write_result(result, self.out, extra_files=files)
+        rmtree(journal_of(self.out), ignore_errors=True)
 
 
 def _tell(result: Result, metrics: Mapping[str, float], out: Path, seconds: float) -> None:

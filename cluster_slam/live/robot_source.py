@@ -125,7 +125,7 @@ class RobotSource:
 
     def host_time(self, view: View) -> float:
         """When a view was taken, on this machine's clock."""
-        if self._is_own_clock is None:
+        if self._is_own_clock is not False:  # one late view makes no other clock
             self._is_own_clock = abs(view.arrival - view.stamp) > _SAME_CLOCK_S
         if not self._is_own_clock:
             return view.stamp

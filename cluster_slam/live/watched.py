@@ -64,6 +64,11 @@ class WatchedTable:
         self._n_bad = 0
         self.problems: list[str] = []
 
+    def skip(self) -> None:
+        """Leave out what is there already: it is of another time."""
+        self.take()
+        self._rows, self.problems = [], []
+
     def take(self) -> list[View]:
         """Views that are complete."""
         lines = [line for line in self._tail.lines() if line]
@@ -133,6 +138,10 @@ class WatchedImages:
         self._seen: set[str] = set()
         self._has_depth = False
 
+    def skip(self) -> None:
+        """Leave out what is there already."""
+        self._seen |= {path.name for path in (self._folder / "rgb").glob("*")}
+
     def take(self) -> list[View]:
         """Views of new images, by stamp."""
         new = [path for path in sorted((self._folder / "rgb").glob("*")) if path.name not in self._seen]
@@ -169,7 +178,10 @@ class WatchedImages:
 
 
 class WatchedFolder:
-    """A folder that grows, as a camera. It is over when a file ``done`` lies in it and all is taken."""
+    """A folder that grows, as a camera. It is over when a file ``done`` lies in it and all is taken.
+
+    What was there before it is entered is of an earlier run, and left out.
+    """
 
     def __init__(self, folder: Path) -> None:
         if not folder.is_dir():
@@ -186,6 +198,8 @@ class WatchedFolder:
         self._looked = -float("inf")  # monotonic
 
     def __enter__(self) -> Self:
+        self._table.skip()
+        self._images.skip()
         return self
 
     def __exit__(

@@ -23,12 +23,15 @@ from cluster_slam.online.records import Revision, Update
 
 if TYPE_CHECKING:
     from cluster_slam.online.tracker import OnlineTracker
+    from cluster_slam.records import Frame
 
 MARK_S = 1.0  # between two marks
 _ROWS = np.dtype([("frame", "<i4"), ("flower", "<i4"), ("cluster", "<i4"), ("reason", "<i4"), ("nis", "<f4")])
 _FRAMES = np.dtype([("stamp", "<f8"), ("pose", "<f8", 7)])
 _DRIFT = np.dtype([("frame", "<i4"), ("cluster", "<i4"), ("position", "<f8", 3), ("cov", "<f4", (3, 3))])
-_TABLES = {"rows.bin": _ROWS, "frames.bin": _FRAMES, "drift.bin": _DRIFT}
+_GIVEN = np.dtype([("pose", "<f8", (4, 4))])  # of a live frame: nobody else keeps what came in
+_POINTS = np.dtype([("point", "<f8", 3), ("cov", "<f8", (3, 3)), ("score", "<f8")])
+_TABLES = {"rows.bin": _ROWS, "frames.bin": _FRAMES, "drift.bin": _DRIFT, "given.bin": _GIVEN, "points.bin": _POINTS}
 _TEXTS = ("revisions.txt", "warnings.txt")
 _OURS = ("cluster_slam.online.", "cluster_slam.graph.incremental", "cluster_slam.config", "cluster_slam.records")
 _PLAIN = {"list", "dict", "set", "frozenset", "tuple", "int", "float", "bool", "slice", "range", "deque", "bytearray"}
@@ -42,11 +45,16 @@ def journal_of(out: Path) -> Path:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Told:
-    """All that a journal holds: rows of points, frames and drift as structured arrays, revisions and warnings."""
+    """All that a journal holds: rows of points, frames and drift as structured arrays, revisions and warnings.
+
+    Of a live source also what came in: ``given`` poses and ``points``; of a session these are empty.
+    """
 
     rows: NDArray[Any]
     frames: NDArray[Any]
     drift: NDArray[Any]
+    given: NDArray[Any]
+    points: NDArray[Any]
     revisions: tuple[str, ...]
     warnings: tuple[str, ...]
 
@@ -82,14 +90,24 @@ class Journal:
             except OSError:
                 continue  # a full disk has been told of by the write that met it
 
-    def write(self, update: Update, tracker: OnlineTracker) -> None:
-        """Append what an update says."""
+    def keep(self, frame: Frame) -> None:
+        """Append what came in with a frame, before what an update says of it."""
+        given, points = np.zeros(1, _GIVEN), np.zeros(len(frame), _POINTS)
+        given["pose"] = frame.pose
+        points["point"], points["cov"] = frame.points, frame.covs
+        points["score"] = np.nan if frame.scores is None else frame.scores
+        self._append("given.bin", given.tobytes())
+        self._append("points.bin", points.tobytes())
+
+    def write(self, update: Update, tracker: OnlineTracker, stamp: float | None = None) -> None:
+        """Append what an update says; ``stamp`` is the frame's on a clock that never goes back, its own where None."""
         i, q = self.n_frames, len(update.flower_ids)
         rows = np.zeros(q, _ROWS)
         rows["frame"], rows["flower"], rows["cluster"] = i, update.flower_ids, update.cluster_ids
         rows["reason"], rows["nis"] = update.reasons, update.nis
         frame = np.zeros(1, _FRAMES)
-        frame["stamp"], frame["pose"] = update.stamp, tum_from_pose(update.T_world_camera)
+        at = update.stamp if stamp is None else stamp
+        frame["stamp"], frame["pose"] = at, tum_from_pose(update.T_world_camera)
         tracks = update.tracks
         seen = np.flatnonzero(tracks.seen > 0)
         drift = np.zeros(len(seen), _DRIFT)
@@ -98,12 +116,12 @@ class Journal:
         self._append("rows.bin", rows.tobytes())
         self._append("frames.bin", frame.tobytes())
         self._append("drift.bin", drift.tobytes())
-        self._append("revisions.txt", "".join(_line(update.stamp, r) for r in update.revisions).encode())
-        self._append("warnings.txt", "".join(f"{update.stamp:.6f} {w}\n" for w in update.warnings).encode())
+        self._append("revisions.txt", "".join(_line(at, r) for r in update.revisions).encode())
+        self._append("warnings.txt", "".join(f"{at:.6f} {w}\n" for w in update.warnings).encode())
         self.n_frames += 1
-        if update.stamp - self._last_mark >= MARK_S or update.stamp < self._last_mark:
+        if at - self._last_mark >= MARK_S or at < self._last_mark:
             self.mark(tracker)
-            self._last_mark = update.stamp
+            self._last_mark = at
 
     def mark(self, tracker: OnlineTracker) -> None:
         """From here a killed run can go on."""
@@ -137,7 +155,7 @@ def read_journal(folder: Path) -> Told:
         content = (folder / name).read_bytes()
         tables.append(np.frombuffer(content[: len(content) // kind.itemsize * kind.itemsize], kind))
     texts = [tuple((folder / name).read_text("utf-8", "replace").splitlines()) for name in _TEXTS]
-    return Told(tables[0], tables[1], tables[2], texts[0], texts[1])
+    return Told(tables[0], tables[1], tables[2], tables[3], tables[4], texts[0], texts[1])
 
 
 def resume(out: Path, session_id: str) -> tuple[OnlineTracker, int]:

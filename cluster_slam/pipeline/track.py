@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,8 +15,9 @@ from cluster_slam.config import OnlineConfig
 from cluster_slam.errors import ClusterSlamError
 from cluster_slam.geometry import Array
 from cluster_slam.live.replay import Replay
-from cluster_slam.live.view import FrameSource
-from cluster_slam.online.journal import Journal
+from cluster_slam.live.view import FrameSource, Notice
+from cluster_slam.online.intake import usable_points
+from cluster_slam.online.journal import Journal, Told
 from cluster_slam.online.journal import resume as resume_journal
 from cluster_slam.online.records import Update
 from cluster_slam.online.result import make_result
@@ -23,6 +25,8 @@ from cluster_slam.online.tracker import OnlineTracker
 from cluster_slam.records import Calibration, Frame, Observations, Result, Session
 
 Progress = Callable[[str, float], None]
+_NO_POINTS = "rows that are no points were left out"
+_MOST_WARNINGS = 200  # of a run of days, with a stamp in each
 
 
 class StoppedError(ClusterSlamError):
@@ -101,53 +105,75 @@ def track_source(
     calibration: Calibration | None = None,
     config: OnlineConfig | None = None,
     seed: int = 0,
+    resume: bool = False,
     on_update: Callable[[Update], None] | None = None,
+    on_notice: Callable[[Notice], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Result:
     """Follow a live source until it ends or somebody wants to stop; frames that were refused are in no table.
 
-    Parameters as of ``track``; the journal lies beside ``out`` until the caller has written the result.
+    Parameters as of ``track``; ``on_notice`` is called with what happens to the source. The journal lies beside
+    ``out`` until the caller has written the result, and holds what came in as well: memory does not grow.
+
+    Raises
+    ------
+    InputError
+        There is nothing to resume.
+    OutputError
+        The journal cannot be written; what was tracked so far is in it.
     """
     header = source.header
-    tracker, _ = _begin(header, out, calibration, config, seed, resume=False)
-    taken: list[Frame] = []
-    times: list[float] = []
-    warnings: list[str] = []
+    tracker, n_done = _begin(header, out, calibration, config, seed, resume)
+    times, told = array("d"), dict.fromkeys(header.warnings)
     begun = perf_counter()
-    with Journal(out, header.id) as journal:
-        for frame in source.frames():
+    with Journal(out, header.id, n_frames=n_done) as journal:
+        for given in source.frames():
+            frame = _points_only(given)
             before = process_time()
             update = tracker.step(frame)
-            if update.is_accepted and (not taken or frame.stamp > taken[-1].stamp):
-                journal.write(update, tracker)
-                taken.append(frame)
-            else:
-                warnings.extend(update.warnings)
+            if update.is_accepted:
+                journal.keep(frame)
+                journal.write(update, tracker, tracker.last_stamp)
             times.append(process_time() - before)
-            warnings.extend(notice.text for notice in source.notices())
+            told |= dict.fromkeys(update.warnings if len(frame) == len(given) else (*update.warnings, _NO_POINTS))
+            _pass_on(source.notices(), told, on_notice)
             if on_update is not None:
                 on_update(update)
             if should_stop is not None and should_stop():
                 break
+        _pass_on(source.notices(), told, on_notice)
         journal.mark(tracker)
-        session = _session_of(header, taken)
-        result = make_result(session, tracker, journal.read(), _timings(np.array(times), perf_counter() - begun))
-    return replace(result, seed=seed, warnings=tuple(dict.fromkeys([*result.warnings, *warnings])))
+        said = journal.read()
+        session = _session_of(header, said)
+        result = make_result(session, tracker, said, _timings(np.array(times), perf_counter() - begun))
+    return replace(result, seed=seed, warnings=tuple(dict.fromkeys([*result.warnings, *told]))[:_MOST_WARNINGS])
 
 
-def _session_of(header: Session, frames: list[Frame]) -> Session:
+def _points_only(frame: Frame) -> Frame:
+    """The frame without rows that are no points: a session has none."""
+    usable = usable_points(frame.points, frame.covs)
+    if usable.all():
+        return frame
+    scores = None if frame.scores is None else frame.scores[usable]
+    return replace(frame, points=frame.points[usable], covs=frame.covs[usable], scores=scores)
+
+
+def _pass_on(notices: list[Notice], told: dict[str, None], listen: Callable[[Notice], None] | None) -> None:
+    for notice in notices:
+        told[f"{notice.kind.value}: {notice.text}"] = None
+        if listen is not None:
+            listen(notice)
+
+
+def _session_of(header: Session, said: Told) -> Session:
     """The session that a live source has been."""
-    counts = [len(f) for f in frames]
-    none = np.zeros(0)
-    scores = [np.full(len(f), np.nan) if f.scores is None else f.scores for f in frames]
     observations = Observations(
-        frame=np.repeat(np.arange(len(frames)), counts),
-        points=np.concatenate([none.reshape(0, 3), *(f.points for f in frames)]),
-        covs=np.concatenate([none.reshape(0, 3, 3), *(f.covs for f in frames)]),
-        scores=np.concatenate([none, *scores]),
+        frame=said.rows["frame"].astype(np.int64),
+        points=said.points["point"].copy(),
+        covs=said.points["cov"].copy(),
+        scores=said.points["score"].copy(),
     )
-    stamps = np.array([f.stamp for f in frames])
-    poses = np.array([f.pose for f in frames]).reshape(-1, 4, 4)
+    stamps, poses = said.frames["stamp"].copy(), said.given["pose"].copy()
     return replace(header, stamps=stamps, poses=poses, observations=observations)
 
 
