@@ -101,7 +101,6 @@ class OnlineConfig:
     confirm_hits: int = 3  # of ...
     confirm_of: int = 5  # ... the last so many looks: then a flower is a landmark
     forget_looks: int = 8  # looks in vain after which a tentative flower is forgotten
-    clutter_per_frame: float = 0.5  # expected before the data say how many there are
     lost_s: float = 2.0  # a cluster unseen for so long is lost (and comes back as itself)
     keyframe_s: float = 0.2  # the map is solved this often
     regroup_s: float = 1.0  # flowers are grouped this often, sooner where new ones were confirmed

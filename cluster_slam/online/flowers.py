@@ -24,6 +24,7 @@ _FIELDS: dict[str, tuple[tuple[int, ...], type]] = {
     "found": ((), np.float64),  # of those, how many saw it
     "confirmed": ((), np.bool_),
     "told": ((), np.bool_),  # its id has been given out
+    "kind": ((), np.int64),  # of place where it was born
     "seat": ((), np.int64),  # of a confirmed flower in the grouping's sums, -1 of a tentative one
 }
 
@@ -45,6 +46,7 @@ class FlowerTable:
     found: Array
     confirmed: BoolArray
     told: BoolArray
+    kind: IntArray
     seat: IntArray
 
     def __init__(self) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from cluster_slam.association.frames import information, point_jacobian
 from cluster_slam.geometry import Array, inverse, transform
 from cluster_slam.online.associate import Seen, View
+from cluster_slam.online.births import ALONE, BESIDE, DOUBTFUL
 from cluster_slam.online.matching import match
 from cluster_slam.online.world import Snapshot, World
 from cluster_slam.records import BoolArray, IntArray, RejectReason
@@ -17,7 +18,8 @@ from tracking.gating import chi2_threshold
 
 _KEEP = 0.998  # of the count of looks, from look to look
 _VIEW = -0.02  # at the rim of the view nothing is a miss
-_MANY = 2.0  # times as many new points as false ones are usual: then they are flowers, at once
+_WANDER_SPEED = 0.1  # m/s, one sigma an axis of what has just been found and may be swaying ...
+_WANDER_SHARE = 0.2  # ... but never so much of how close flowers stand that they could be mistaken
 _GHOST_LOOKS = 15  # looks at a landmark before it can be found to be none ...
 _GHOST_SHARE = 0.3  # ... seen in so small a share of them, compared with the others
 _WILD_CHI2 = 150.0  # 3 degrees of freedom: errors of up to five times what is stated ...
@@ -33,14 +35,16 @@ def live(world: World, seen: Seen, view: View, T: Array, w: Array) -> tuple[IntA
     claim_wild(world, seen, view, w, row_of)
     match_tentative(world, seen, view, T, w, row_of)
     count_hits(world, row_of[row_of >= 0], view.stamp)
-    count_misses(world, seen.at, T, view.c, row_of[row_of >= 0])
+    missing = count_misses(world, seen.at, T, view.c, row_of[row_of >= 0])
     note_motion(world, seen, w, view.S, view.number)
     reasons = np.where(row_of >= 0, int(RejectReason.ACCEPTED), int(RejectReason.POSITION_GATE))
-    n_born = bear(world, seen, view, T, w, row_of, reasons)
+    bear(world, seen, view, T, w, row_of, reasons, missing)
+    world.births.note_view(view.stamp, T)
     shown = row_of >= 0
     rows = row_of[shown]
-    is_flower = (table.n[rows] >= world.config.confirm_hits) | (n_born > _MANY * world.clutter_rate)
-    table.told[rows] |= is_flower
+    n = table.n[rows]
+    is_seen_often = (n >= world.config.confirm_hits) & ~world.births.is_doubtful(table.kind[rows])
+    table.told[rows] |= table.confirmed[rows] | is_seen_often | world.births.is_flower(table.kind[rows], n)
     shown[shown] = table.told[rows]
     reasons[(row_of >= 0) & ~shown] = int(RejectReason.UNCONFIRMED)
     confirm(world, view.stamp)
@@ -83,6 +87,7 @@ def match_tentative(world: World, seen: Seen, view: View, T: Array, w: Array, ro
     J = point_jacobian(T[:3, :3], view.c[left])
     cov = view.S[left] + J @ seen.pose.cov @ np.swapaxes(J, 1, 2)
     at = table.place[tentative] + seen.at.d[slot]
+    table.cov[tentative] += wander(world, tentative, view.stamp)[:, None, None] * np.eye(3)
     m = match(at, table.cov[tentative] + seen.at.P[slot] + slack, w[left], cov, world.config.gate_chi2)
     rows, cols = tentative[m.rows], left[m.cols]
     row_of[cols] = rows
@@ -91,6 +96,14 @@ def match_tentative(world: World, seen: Seen, view: View, T: Array, w: Array, ro
     table.place[rows] += (gain @ (w[cols] - seen.at.d[table.slot[rows]] - table.place[rows])[..., None])[..., 0]
     P = P - gain @ P
     table.cov[rows] = 0.5 * (P + np.swapaxes(P, 1, 2))
+
+
+def wander(world: World, rows: IntArray, stamp: float) -> Array:
+    """Variance (k,) of how far flowers may have gone since the last frame, whose cluster is new: it may sway."""
+    table = world.flowers
+    is_new = np.array([k.state == "tentative" for k in world.clusters])[table.slot[rows]]
+    far = min(_WANDER_SPEED * world.usual_dt, _WANDER_SHARE * world.spacing)
+    return np.where(is_new & (table.first[rows] < stamp), far * far, 0.0)
 
 
 def count_hits(world: World, hit: IntArray, stamp: float) -> None:
@@ -103,26 +116,28 @@ def count_hits(world: World, hit: IntArray, stamp: float) -> None:
     table.found[hit] = _KEEP * table.found[hit] + 1.0
 
 
-def count_misses(world: World, at: Snapshot, T: Array, c: Array, hit: IntArray) -> None:
-    """Count the looks in vain."""
-    table = world.flowers
+def count_misses(world: World, at: Snapshot, T: Array, c: Array, hit: IntArray) -> IntArray:
+    """Count the looks in vain; returns how many landmarks of each cluster (c,) were in view and not seen."""
+    table, n = world.flowers, len(world.clusters)
     if not len(table) or not len(c):
-        return
+        return np.zeros(n, dtype=np.int64)
     expected = world.expected(np.arange(len(table)), at)
     missed = world.in_view(T, expected, _VIEW)
     missed[hit] = False
-    witness = np.zeros(len(world.clusters), dtype=bool)
+    missing = np.bincount(table.slot[missed & table.confirmed], minlength=n)
+    witness = np.zeros(n, dtype=bool)
     witness[table.slot[hit]] = True
-    alone = np.bincount(table.slot, minlength=len(world.clusters)) < 2
+    alone = np.bincount(table.slot, minlength=n) < 2
     rows = np.flatnonzero(missed & (witness[table.slot] | alone[table.slot] | ~table.confirmed))
     if not len(rows):
-        return
+        return missing
     clear = ~is_hidden(transform(inverse(T), expected[rows]), c, _FLOWER_SHARE * min(world.spacing, 0.1))
     rows = rows[clear]
     table.hits[rows] <<= 1
     table.vain[rows] += 1
     table.looks[rows] = _KEEP * table.looks[rows] + 1.0
     table.found[rows] *= _KEEP
+    return missing
 
 
 def is_hidden(p: Array, c: Array, radius: float) -> BoolArray:
@@ -143,7 +158,16 @@ def note_motion(world: World, seen: Seen, w: Array, S: Array, number: int) -> No
     world.grouping.observe(world.flowers.seat[seen.rows], u, var)
 
 
-def bear(world: World, seen: Seen, view: View, T: Array, w: Array, row_of: IntArray, reasons: IntArray) -> int:
+def bear(
+    world: World,
+    seen: Seen,
+    view: View,
+    T: Array,
+    w: Array,
+    row_of: IntArray,
+    reasons: IntArray,
+    missing: IntArray,
+) -> None:
     """Points that nobody claims begin tentative flowers, in the cluster next to them or in one of their own."""
     left, known = np.flatnonzero(row_of < 0), np.flatnonzero(row_of >= 0)
     if len(left) and len(known):
@@ -154,16 +178,34 @@ def bear(world: World, seen: Seen, view: View, T: Array, w: Array, row_of: IntAr
         reasons[left[doubled]] = int(RejectReason.TAKEN)
         left = left[~doubled]
     if not len(left):
-        return 0
+        return
     note_spacing(world, w)
     slot = slots_for(world, w, left, known, row_of, view.stamp)
     d = np.zeros((len(world.clusters), 3))
     d[: len(seen.at.d)] = seen.at.d
     J = point_jacobian(T[:3, :3], view.c[left])
     cov = view.S[left] + J @ seen.pose.cov @ np.swapaxes(J, 1, 2)
+    kind = world.births.kind(kind_of_place(world, slot, missing), is_fresh(world, w[left]))
     row_of[left] = world.flowers.add(w[left] - d[slot], cov, J, slot, view.stamp)
+    world.flowers.kind[row_of[left]] = kind
     world.place_anchors(np.unique(slot))
-    return len(left)
+
+
+def kind_of_place(world: World, slot: IntArray, missing: IntArray) -> IntArray:
+    """Whether new flowers (k,) stand alone, or beside a known cluster; clusters may be ``missing`` (c,) some."""
+    known = np.array([cluster.state != "tentative" for cluster in world.clusters])
+    misses = np.zeros(len(known), dtype=np.int64)
+    misses[: len(missing)] = missing
+    is_doubtful = misses >= np.bincount(slot, minlength=len(known))
+    place: IntArray = np.where(known[slot], np.where(is_doubtful[slot], DOUBTFUL, BESIDE), ALONE)
+    return place
+
+
+def is_fresh(world: World, w: Array) -> BoolArray:
+    """Which places (k, 3) were not in view a moment ago."""
+    if not world.births.past:
+        return np.ones(len(w), dtype=bool)
+    return ~world.in_view(world.births.past[0][1], w, _VIEW)
 
 
 def note_spacing(world: World, w: Array) -> None:
@@ -199,8 +241,11 @@ def slots_for(world: World, w: Array, left: IntArray, known: IntArray, row_of: I
 def confirm(world: World, stamp: float) -> None:
     """M of N: tentative flowers that were seen often enough become landmarks."""
     table, config = world.flowers, world.config
-    count = np.bitwise_count(table.hits & ((1 << config.confirm_of) - 1))
-    for row in np.flatnonzero(~table.confirmed & (count >= config.confirm_hits)).tolist():
+    times = np.where(world.births.is_doubtful(table.kind), 2, 1)  # a known flower that moved will have been found
+    count = np.bitwise_count(table.hits & ((1 << times * config.confirm_of) - 1))
+    new = np.flatnonzero(~table.confirmed & (count >= times * config.confirm_hits))
+    world.births.became_flowers(table.kind[new])
+    for row in new.tolist():
         table.confirmed[row] = True
         table.seat[row] = world.grouping.sit()
         cluster, lever = world.clusters[int(table.slot[row])], table.lever[row]
@@ -220,8 +265,7 @@ def forget(world: World) -> None:
         return
     patience = np.where(table.n <= 1, config.confirm_of - config.confirm_hits, config.forget_looks)
     gone = ~table.confirmed & (table.vain >= patience)
-    n_false = int((gone & (table.n <= 2)).sum())
-    world.clutter_rate += 0.02 * (n_false - world.clutter_rate)
+    world.births.were_false(table.kind[gone], table.n[gone])
     share = table.found / np.maximum(table.looks, 1.0)
     sure = table.confirmed & (table.looks > _GHOST_LOOKS)
     if sure.any():
@@ -229,5 +273,6 @@ def forget(world: World) -> None:
         for row in np.flatnonzero(ghost).tolist():
             world.map.remove(int(table.ids[row]))
             world.say("forgotten", "flower", int(table.ids[row]), -1, "it was looked for in vain")
+            world.births.were_false(table.kind[row : row + 1], table.n[row : row + 1])
         gone |= ghost
     world.drop(gone)

@@ -11,6 +11,8 @@ from cluster_slam.records import IntArray
 _FEW_LOOKS = 2  # of each of two landmarks, before it is believed that they are never seen together
 _TOGETHER = 0.15  # share of the rarer one's looks that saw both: two flowers
 _DOUBLE = 0.6  # of how close flowers stand: nearer landmarks may be one
+_ALTERNATING = 6  # times of the rarer one, the other never there: then they may stand farther apart ...
+_SWAYED = 1.2  # ... as the place of one was taken while it swayed
 
 
 def solve_near(world: World, stamp: float, since: float) -> None:
@@ -48,7 +50,12 @@ def merge_doubles(world: World) -> None:
     sigma = np.sqrt(np.trace(table.cov[rows], axis1=1, axis2=2) / 3.0)
     gap = np.linalg.norm(table.place[rows][:, None] - table.place[rows][None], axis=-1)
     likely = np.maximum(0.5 * _DOUBLE * world.spacing, 3.0 * (sigma[:, None] + sigma[None]))
-    close = np.argwhere(np.triu(gap < np.minimum(_DOUBLE * world.spacing, likely), 1))
+    likely = np.minimum(_DOUBLE * world.spacing, likely)
+    seat, slot = table.seat[rows], table.slot[rows]
+    counts = world.grouping.counts[seat[:, None], seat]
+    each = np.diag(counts)
+    never = (counts == 0) & (np.minimum(each[:, None], each) >= _ALTERNATING) & (slot[:, None] == slot)
+    close = np.argwhere(np.triu((gap < likely) | (never & (gap < _SWAYED * world.spacing)), 1))
     gone = np.zeros(len(table), dtype=bool)
     for a, b in rows[close].tolist():
         both, fewer = world.grouping.together(int(table.seat[a]), int(table.seat[b]))
@@ -60,6 +67,7 @@ def merge_doubles(world: World) -> None:
         table.n[stays] += table.n[goes]
         world.merged.append((from_id, to_id))
         world.say("merged", "flower", from_id, to_id, "one place, never seen together")
+        world.births.were_false(table.kind[goes : goes + 1], table.n[goes : goes + 1])
         gone[goes] = True
     world.drop(gone)
 

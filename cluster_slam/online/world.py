@@ -9,6 +9,7 @@ import numpy as np
 from cluster_slam.config import OnlineConfig
 from cluster_slam.geometry import Array, inverse, transform
 from cluster_slam.graph.incremental import IncrementalMap
+from cluster_slam.online.births import Births
 from cluster_slam.online.cluster import ClusterTrack
 from cluster_slam.online.flowers import FlowerTable
 from cluster_slam.online.grouping import OnlineGrouping
@@ -44,7 +45,7 @@ class World:
         self.revisions: list[Revision] = []  # of the present frame
         self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)  # of x / z, y / z and z of all points so far
         self.spacing = np.inf  # m, how close flowers stand
-        self.clutter_rate = config.clutter_per_frame
+        self.births = Births()
         self.usual_dt = 1.0 / 30.0
         self.x = np.zeros(6)  # hand-eye tangent
         self._next_cluster = 0
