@@ -48,6 +48,14 @@ class Calibration:
     power: float = 0.0
     along: float = 1.0
 
+    def in_words(self) -> tuple[str, ...]:
+        """What was found to be wrong, for people."""
+        when = "later" if self.lag_s > 0 else "earlier"
+        late = f"points are stamped {abs(self.lag_s):.2f} s {when} than poses of the same moment"
+        taken = f"points lie at their range times the cosine of the angle off the axis to the power {self.power:.2f}"
+        found = ((late, self.lag_s), (f"{taken}, as where a depth was taken for a range", self.power))
+        return tuple(f"{words}; corrected" for words, size in found if size)
+
     def correct(self, frames: Frames) -> Frames:
         """The points where they are, with the noise that is left."""
         r = np.linalg.norm(frames.points, axis=1)

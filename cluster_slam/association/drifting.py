@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from cluster_slam.association.calibration import calibrate, delayed
+from cluster_slam.association.calibration import Calibration, calibrate, delayed
 from cluster_slam.association.drift_smoother import DriftSmoother, Steps, steps_of
 from cluster_slam.association.frames import Frames
 from cluster_slam.association.particles import trace_stretch
@@ -32,7 +32,8 @@ class Traced:
     """Camera poses (n, 4, 4), landmark of each point (m,) or -1, places (l, 3), covariances (n - 1, 6, 6) of the steps.
 
     The covariances are the given ones as the session has shown them: larger where odometry slipped. ``cost`` is twice
-    the negative log-likelihood with the landmarks' price.
+    the negative log-likelihood with the landmarks' price. All holds for frames and poses as ``instruments`` correct
+    them.
     """
 
     T: Array
@@ -40,6 +41,7 @@ class Traced:
     places: Array
     cov_step: Array
     cost: float
+    instruments: Calibration
 
 
 def needs_tracing(frames: Frames, given: Array, cov_step: Array) -> bool:
@@ -74,10 +76,9 @@ def trace_drifting(
     seen, late = calibration.correct(frames), delayed(given, frames.stamps, calibration.lag_s)
     tracer = _Tracer(seen, late, steps_of(late, cov_step, frames.stamps, config), config, rng)
     best = _anchored(tracer.redo(tracer.price(tracer.assemble())), given[0])
-    steps = steps_of(given, cov_step, frames.stamps, config)
-    weights = DriftSmoother(frames, steps, config.point_dof).step_weights(best.T)
+    weights = DriftSmoother(seen, tracer.steps, config.point_dof).step_weights(best.T)
     scaled = cov_step * (config.odometry_scale**2 / weights)[:, None, None]
-    return Traced(best.T, best.label, best.places, scaled, best.cost)
+    return Traced(best.T, best.label, best.places, scaled, best.cost, calibration)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -247,10 +248,12 @@ class _Tracer:
         T[a - first : b - first], label[inside] = found.T, found.label
         new = part.local(smoother, T, label, found.places, inside)
         n_new = len(np.unique(new.label[new.label >= len(state.places)]))
-        if new.cost + price * n_new >= old.cost - 1e-6:
-            return state
         T, label = state.T.copy(), state.label.copy()
         T[first:end], label[around] = new.T, new.label
+        before = state.label.copy()
+        before[around] = old.label
+        if new.cost + price * n_new + _choice_cost(label) >= old.cost + _choice_cost(before) - 1e-6:
+            return state
         return _State(T, label, np.concatenate([state.places, new.places[len(state.places) :]]), np.inf)
 
     def local(
@@ -285,7 +288,8 @@ class _Tracer:
                 break
         T, places = smoother.solve(T, places, label)
         clutter = self.config.clutter_cost * int((label < 0).sum())
-        return _State(T, label, places, smoother.cost(T, places, label) + clutter + price * len(places))
+        cost = smoother.cost(T, places, label) + clutter + price * len(places) + _choice_cost(label)
+        return _State(T, label, places, cost)
 
     def _smoother(self, n: int) -> DriftSmoother:
         f = self.frames
@@ -341,6 +345,16 @@ class _Tracer:
         allowed &= (distance < self.config.merge_reach_m) & np.tri(n, k=-1, dtype=bool)
         pairs = sorted((float(distance[a, b]), int(a), int(b)) for a, b in np.argwhere(allowed))
         return [(a, b) if count[a] <= count[b] else (b, a) for _, a, b in pairs]
+
+
+def _choice_cost(label: IntArray) -> float:
+    """Twice the negative log-probability of the labels (m,), given how often each landmark is seen.
+
+    Without it two landmarks always fit the points of one better than one does: each point takes the nearer.
+    """
+    count = np.bincount(label[label >= 0])
+    count = count[count > 0]
+    return float(-2.0 * (count * np.log(count / max(count.sum(), 1))).sum())
 
 
 def _compact(places: Array, label: IntArray) -> tuple[Array, IntArray]:

@@ -25,7 +25,7 @@ from cluster_slam.smoothing.rounds import (
     settle,
     solve,
 )
-from cluster_slam.smoothing.world import World, for_solving, learn, with_variances
+from cluster_slam.smoothing.world import World, corrected, for_solving, learn, with_variances
 
 Progress = Callable[[str, float], None]
 
@@ -54,6 +54,7 @@ def smooth(
     stated_poses = pose_model(session)
     say("calibrating", 0.0)
     world = first_world(stated, stated_poses, config, rng)
+    stated, stated_poses = corrected(stated, stated_poses, world.instruments)
     clock.lap("landmarks")
     merged: list[tuple[int, int]] = []
     if world.cov_step is None:  # where drift was followed, the association has been made with it

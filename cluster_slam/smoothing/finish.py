@@ -81,7 +81,7 @@ def make_result(
             "outliers": int((np.nan_to_num(estimate.residual_chi2) > threshold).sum()),
             "merged": len(merged),  # before ids were given: none of them was ever used
         },
-        warnings=(*session.warnings, *unobserved, *warnings),
+        warnings=(*session.warnings, *world.instruments.in_words(), *unobserved, *warnings),
         status="poor" if warnings else "ok",
     )
 

@@ -51,6 +51,7 @@ def world_of_drifting_poses(
         noise=VarianceFactors(1.0, 1.0, 1.0),
         held=np.zeros((6, 6)),
         cov_step=traced.cov_step if model.X0 is None else None,
+        instruments=traced.instruments,
     )
 
 

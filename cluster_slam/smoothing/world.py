@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from cluster_slam.association.calibration import Calibration, delayed
 from cluster_slam.association.frames import Frames
 from cluster_slam.config import SmoothConfig
 from cluster_slam.geometry import Array
@@ -31,6 +32,12 @@ class World:
     cov_step: Array | None = None  # (n - 1, 6, 6) of odometry, where following its drift has told more than is stated
     wild_share: float = 0.0  # of observations whose errors are several times what the others' are
     errs_slowly: bool = False  # errors of observations cannot be told from drift of the poses
+    instruments: Calibration = field(default_factory=Calibration)  # what the session shows to be wrong with them
+
+
+def corrected(frames: Frames, model: PoseModel, instruments: Calibration) -> tuple[Frames, PoseModel]:
+    """The session without what its instruments do wrong."""
+    return instruments.correct(frames), replace(model, given=delayed(model.given, frames.stamps, instruments.lag_s))
 
 
 def with_variances(frames: Frames, model: PoseModel, noise: VarianceFactors) -> tuple[Frames, PoseModel]:
