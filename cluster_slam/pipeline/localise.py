@@ -13,10 +13,12 @@ from cluster_slam.config import LocaliseConfig
 from cluster_slam.geometry import inverse, se3_exp, se3_log
 from cluster_slam.localisation import Landmarks, Localisation, Localiser
 from cluster_slam.localisation.following import Follower, Place
+from cluster_slam.localisation.instruments import corrected
 from cluster_slam.localisation.learning import Seen, learn_scale
 from cluster_slam.localisation.motion import Motion, motion_of
-from cluster_slam.localisation.planar import Flat, FlatFollower, flat_world
+from cluster_slam.localisation.planar import Flat, flat_world
 from cluster_slam.localisation.scene import ErrorScale, Look, make_look
+from cluster_slam.localisation.vehicle import FlatFollower
 from cluster_slam.records import CLUTTER, IntArray, PlantMap, PoseHypotheses, Session, SessionLocalisation
 from tracking.gating import chi2_threshold
 
@@ -68,7 +70,7 @@ def localise(
     frames.learn()
     flat = None if independent or window else _flat_world(session, motion, localiser)
     if flat is not None:
-        places = _on_floor(frames, flat, localiser.plants[0], motion, seed, say)
+        places = _on_floor(frames, flat, localiser.plants[0], seed, say)
     elif independent or window == 1:
         places = [frames.alone(i) for i in _told(session.n_frames, say)]
     elif window is not None:
@@ -205,15 +207,17 @@ def _flat_world(session: Session, motion: Motion, localiser: Localiser) -> Flat 
     return flat_world(session, motion, localiser.plants[0]) if len(localiser.plants) == 1 else None
 
 
-def _on_floor(frames: _Frames, flat: Flat, marks: Landmarks, motion: Motion, seed: int, say: Progress) -> list[Place]:
+def _on_floor(frames: _Frames, flat: Flat, marks: Landmarks, seed: int, say: Progress) -> list[Place]:
     """Frames of a vehicle on a floor, one after the other."""
-    follower = FlatFollower(flat, marks, motion, np.random.default_rng(seed))
-    o, out = frames.session.observations, []
+    say("finding what the instruments err by", 0.05)
+    right = corrected(frames.session)
+    follower = FlatFollower(flat, marks, motion_of(right.session), np.random.default_rng(seed))
+    o, out = right.session.observations, []
     for i in _told(frames.session.n_frames, say):
         p = follower.step(i, o.points[frames.rows[i]], o.covs[frames.rows[i]])
-        only = ((p.probability, p.T_map_camera),)
+        T, cov = right.on_time(i, p.T_map_camera, p.cov)
         out.append(
-            Place(p.reason, marks.plant, p.probability, p.T_map_camera, p.cov, p.flower_ids, p.cluster_ids, only)
+            Place(p.reason, marks.plant, p.probability, T, cov, p.flower_ids, p.cluster_ids, ((p.probability, T),))
         )
     return out
 

@@ -1,0 +1,84 @@
+"""A vehicle on a floor in a map of landmarks that nobody can tell apart."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cluster_slam.geometry import Array, inverse, se3_exp, se3_log, transform
+from cluster_slam.localisation.instruments import corrected
+from cluster_slam.localisation.landmarks import Landmarks, landmarks
+from cluster_slam.localisation.motion import motion_of
+from cluster_slam.localisation.planar import flat_world
+from cluster_slam.pipeline.localise import localise
+from cluster_slam.records import Observations, Session, StatedNoise
+
+PLACES = np.array([[0.0, 0.0], [3.1, 0.4], [5.2, 2.9], [1.2, 3.3], [-1.4, 1.9], [3.4, 5.6], [-0.6, 5.0], [6.4, 5.1]])
+
+
+def drive(n: int, rng: np.random.Generator, gain: float = 0.0) -> tuple[Session, Array, Landmarks]:
+    """A session of odometry on the plane y = 0 of the camera, its true poses in the map, and the map."""
+    t = 0.5 * np.arange(n)
+    x, z = 2.5 + 1.6 * np.sin(0.11 * t), 2.7 + 1.6 * np.sin(0.17 * t + 1.0)
+    heading = np.arctan2(np.gradient(x), np.gradient(z))
+    tangents = np.zeros((n, 6))
+    tangents[:, 1] = heading
+    flat = se3_exp(tangents)
+    flat[:, 0, 3], flat[:, 2, 3] = x, z
+    upright = se3_exp(np.array([-np.pi / 2, 0.0, 0.0, 0.0, 0.0, 0.0]))  # the map's z is up
+    true = upright @ flat
+    marks = landmarks(transform(upright, np.column_stack([PLACES[:, 0], np.zeros(8), PLACES[:, 1]])), np.arange(8))
+    step = inverse(flat[:-1]) @ flat[1:]
+    error = np.zeros((n - 1, 6))
+    error[:, 1], error[:, 5] = 0.01 * rng.normal(size=n - 1), 0.01 * rng.normal(size=n - 1)
+    given = [np.eye(4)]
+    for k in range(n - 1):
+        given.append(given[-1] @ step[k] @ se3_exp(error[k]))
+    frame, points = [], []
+    for k in range(n):
+        seen = transform(inverse(true[k]), marks.positions)
+        here = seen[(seen[:, 2] > 0.3) & (np.abs(seen[:, 0]) < 0.7 * seen[:, 2])]
+        r = np.linalg.norm(here, axis=1)
+        noisy = here * (1.0 + gain + 0.02 * rng.normal(size=len(here)) / r)[:, None]
+        noisy[:, 0] += 0.01 * r * rng.normal(size=len(here))
+        noisy[:, 1] = 0.0
+        frame += [k] * len(here)
+        points += list(noisy)
+    m = len(points)
+    seen_all = Observations(
+        np.array(frame), np.array(points), np.tile(np.diag([0.03, 0.01, 0.04]) ** 2, (m, 1, 1)), np.full(m, np.nan)
+    )
+    noise = replace(StatedNoise(), odometry_translation=0.05, odometry_rotation=0.1)
+    session = Session("drive", 100.0 + t, np.array(given), "T_world_camera", "odometry", None, noise, seen_all)
+    return session, true, marks
+
+
+@pytest.mark.parametrize(("seed", "gain"), [(0, 0.0), (1, 0.04)])
+def test_a_vehicle_is_found_also_where_its_ranges_are_too_long(seed: int, gain: float) -> None:
+    session, true, marks = drive(160, np.random.default_rng(seed), gain)
+    found = localise(session, [marks])
+    here = found.is_located
+    assert here[-60:].mean() > 0.9
+    xi = se3_log(inverse(found.T_map_camera[here]) @ true[here])
+    away = np.linalg.norm(xi[:, 3:], axis=1)
+    assert np.median(away) < 0.06
+    assert (away < 0.5).all()
+
+
+def test_what_is_not_flat_is_no_floor() -> None:
+    session, _, marks = drive(20, np.random.default_rng(2))
+    assert flat_world(session, motion_of(session), marks) is not None
+    tall = landmarks(marks.positions + np.random.default_rng(3).normal(0.0, 0.5, (8, 3)), np.arange(8))
+    assert flat_world(session, motion_of(session), tall) is None
+
+
+def test_poses_come_back_to_the_stamps() -> None:
+    """Whatever the clocks err by: the corrected pose moved on by ``since`` is the given one."""
+    session, _, _ = drive(60, np.random.default_rng(4))
+    right = corrected(session)
+    for i in (0, 20, 59):
+        T, cov = right.on_time(i, right.session.poses[i], np.eye(6))
+        np.testing.assert_allclose(T, session.poses[i], atol=1e-12)
+        assert np.linalg.eigvalsh(cov)[0] > 0
