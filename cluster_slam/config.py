@@ -115,7 +115,7 @@ class GrowthConfig:
     """How plants change over days. Priors: what sessions show corrects them."""
 
     drift_m_per_day: float = 0.003  # RMS norm of a cluster's drift; wrong by a factor of two is covered
-    memory_days: float = 30.0  # after so long a cluster drifts in a direction that has nothing to do with today's
+    memory_days: float = 60.0  # after so long a cluster drifts in a direction that has nothing to do with today's
     walk_m_per_sqrt_day: float = 0.0007  # random walk of a cluster, one sigma an axis
     flower_walk_m_per_sqrt_day: float = 0.0005  # of a flower within its cluster
     setting_m: float = 0.0005  # one sigma an axis: how a cluster hangs another time, even on the same day

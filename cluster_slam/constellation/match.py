@@ -33,7 +33,7 @@ class Found:
     plant: PlantMap  # at the session's time, without the flowers that are long gone
     T_map_world: Array  # (4, 4)
     scale: float
-    cov: Array  # (6, 6) of the tangent on the right
+    pairs: Pairs  # matched flowers, both where the session has them in its own world
     space: Space
     scene: Scene
     best: Explained
@@ -96,7 +96,7 @@ def match(
     best = max(candidates, key=lambda c: c.evidence)
     others = [c.evidence for c in candidates if _says_something_else(best, c)]
     name, runner_up = plant.name, max(others, default=-np.inf)
-    found = _found(session, alive, best, similarity)
+    found = _found(session, alive, best)
     return Match(name, best.found.log_ratio, best.evidence, runner_up, repeated, found)
 
 
@@ -259,15 +259,6 @@ def _flower_pairs(candidate: _Candidate) -> set[tuple[int, int]]:
     return set(zip(a.tolist(), b.tolist(), strict=True))
 
 
-def _drifted(plant: PlantMap, days: float) -> float:
-    """Variance along each axis of a cluster's drift since the plant's first session.
-
-    What the clusters of a plant drifted in common cannot be told from a base that stands elsewhere, however often they
-    were seen between: the transform to the frame of the first session is only as sure as their mean drift.
-    """
-    return plant.drift_rate**2 * days**2 / 3.0 + plant.walk_rate**2 * abs(days)
-
-
 def _with_prior(scene: Scene, found: Explained) -> tuple[Scene, Explained]:
     """The explanation again, now that the others say how many of the session's clusters the plant has.
 
@@ -278,7 +269,7 @@ def _with_prior(scene: Scene, found: Explained) -> tuple[Scene, Explained]:
     return scene, explain(scene, found.pose)[0]
 
 
-def _found(session: Constellation, alive: PlantMap, best: _Candidate, similarity: bool) -> Found | None:
+def _found(session: Constellation, alive: PlantMap, best: _Candidate) -> Found | None:
     scene, found = best.scene, best.found
     if best.single:
         scene, found = warped(scene, found)
@@ -290,9 +281,6 @@ def _found(session: Constellation, alive: PlantMap, best: _Candidate, similarity
     row, member = np.nonzero(found.partner >= 0)
     a = session.flowers[scene.query.flower[found.query[row], member]]
     pairs = replace(matched_pairs(scene, found), a=a, b=a)
-    since = float(np.nan_to_num(session.start - np.fmin.reduce(alive.cluster_first_seen, initial=np.nan))) / DAY_S
-    pairs = replace(pairs, var_offset=np.maximum(pairs.var_offset, _drifted(alive, since)))
-    cov = pose_covariance(pairs, scale, with_scale=similarity)
     return Found(
-        alive, best.space.to_map(pose.R[0], pose.t[0], scale), scale, cov, best.space, scene, found, best.single
+        alive, best.space.to_map(pose.R[0], pose.t[0], scale), scale, pairs, best.space, scene, found, best.single
     )

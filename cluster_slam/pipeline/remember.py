@@ -18,6 +18,7 @@ from cluster_slam.io.map.times import iso
 from cluster_slam.io.map.write import Entry, next_ids, put
 from cluster_slam.records import Constellation, PlantMap
 from cluster_slam.remember.decide import Decision, Refusal, decide
+from cluster_slam.remember.gauge import frame_covariance
 from cluster_slam.remember.looked import looked_at
 from cluster_slam.remember.update import aligned, empty_plant, update
 
@@ -141,10 +142,12 @@ def _known(store: MapStore, incoming: Incoming, found: Found, decision: Decision
     rows = np.searchsorted(plant.flower_ids, found.plant.flower_ids)
     is_known = who.flower >= 0
     who = replace(who, flower=np.where(is_known, rows[np.where(is_known, who.flower, 0)], -1))
-    evidence = decision.matches[0].evidence
-    return _entry(
-        store, incoming, plant, found.T_map_world, found.scale, found.cov, who, evidence, decision.probability, config
-    )
+    evidence, T = decision.matches[0].evidence, found.T_map_world
+    now, sessions = incoming.constellation.start, store.sessions(plant.name)
+    low, high = found.scene.scale_range
+    memory = config.growth.memory_days
+    cov = frame_covariance(found.pairs, found.scale, plant, sessions, now, memory, with_scale=low < high)
+    return _entry(store, incoming, plant, T, found.scale, cov, who, evidence, decision.probability, config)
 
 
 def _entry(

@@ -1,0 +1,95 @@
+"""What the map predicts and how sure it says to be of a plant's frame: by hand, by enumeration, by simulation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from map_help import map_of, rest_incoming
+
+from cluster_slam.constellation.fit import Pairs, pose_covariance
+from cluster_slam.constellation.growth import DAY_S
+from cluster_slam.remember.gauge import frame_covariance
+from cluster_slam.remember.predict import learned_seen_share, membership_cov
+from cluster_slam.simulate.config import SimulateConfig
+from cluster_slam.simulate.season import SEASON, SeasonPlant
+
+
+def enumerated(offsets: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Covariance of the centroid of those that are seen, over all ways of being seen but none."""
+    total, weight = np.zeros((3, 3)), 0.0
+    for seen in product((False, True), repeat=len(share)):
+        if any(seen):
+            p = float(np.prod(np.where(seen, share, 1.0 - share)))
+            mean = offsets[list(seen)].mean(axis=0)
+            total, weight = total + p * np.outer(mean, mean), weight + p
+    return total / weight
+
+
+def test_centroids_of_the_flowers_that_are_seen() -> None:
+    """Against all subsets, of two clusters at once; equal shares make the closed form exact."""
+    rng = np.random.default_rng(0)
+    offsets, row = rng.normal(0.0, 0.02, (7, 3)), np.array([0, 0, 0, 1, 1, 1, 1])
+    share = np.array([0.8] * 3 + [0.6] * 4)
+    for c in (0, 1):
+        offsets[row == c] -= offsets[row == c].mean(axis=0)
+    found = membership_cov(offsets, share, row, np.zeros(2), np.zeros(2))
+    for c in (0, 1):
+        np.testing.assert_allclose(found[c], enumerated(offsets[row == c], share[row == c]), rtol=1e-4, atol=1e-9)
+
+
+def test_all_seen_and_nothing_new_moves_no_centroid() -> None:
+    offsets = np.array([[0.01, 0.0, 0.0], [-0.01, 0.0, 0.0]])
+    assert np.abs(membership_cov(offsets, np.ones(2), np.zeros(2, int), np.zeros(1), np.ones(1))).max() < 1e-9
+
+
+def test_an_unknown_flower_beside_one() -> None:
+    """One flower that is always seen and m ~ Poisson(0.3) others of variance 1: E[m / (1 + m)^2] = 0.0677."""
+    m = np.arange(20)
+    poisson = np.exp(-0.3) * 0.3**m / np.cumprod(np.maximum(m, 1))
+    found = membership_cov(np.zeros((1, 3)), np.ones(1), np.zeros(1, int), np.array([0.3]), np.ones(1))
+    np.testing.assert_allclose(found[0], float(poisson @ (m / (1.0 + m) ** 2)) * np.eye(3), rtol=1e-4)
+
+
+def test_the_share_of_flowers_that_are_seen_is_learned(tmp_path: Path) -> None:
+    """Half of the flowers are hidden the second time: from a prior of 0.85 towards a half."""
+    config = replace(SEASON, session=SimulateConfig(n_clusters=12))
+    plant = SeasonPlant(config, seed=3)
+    with map_of(tmp_path, plant) as store:
+        assert learned_seen_share(store.plant("row3"), 0.85) == 0.85
+    hidden = SeasonPlant(replace(config, unseen_share=0.5), seed=3)
+    hidden.grow_to(0.0)
+    from cluster_slam.io.map import open_map
+    from cluster_slam.pipeline.remember import add
+
+    second = rest_incoming(hidden).constellation
+    second = replace(second, session="second", start=second.start + DAY_S, end=second.end + DAY_S)
+    with open_map(tmp_path / "row3.map") as store:
+        assert add(store, replace(rest_incoming(plant), constellation=second)).session is not None
+        assert 0.45 < learned_seen_share(store.plant("row3"), 0.85) < 0.75
+
+
+def test_the_frame_is_as_sure_as_the_mean_drift(tmp_path: Path) -> None:
+    """12 clusters that drift 3 mm a day, seen without an error: the mean of 10 days, 30 / sqrt(3 * 12) mm an axis."""
+    with map_of(tmp_path, SeasonPlant(replace(SEASON, session=SimulateConfig(n_clusters=12)), seed=1)) as store:
+        plant, sessions = replace(store.plant("row3"), walk_rate=0.0), store.sessions("row3")
+    n = len(plant.cluster_ids)
+    a = np.random.default_rng(0).normal(0.0, 0.5, (n, 3))
+    a -= a.mean(axis=0)
+    pairs = Pairs(a, a, np.full(n, 1e-12), np.arange(n), np.zeros(n))
+    cov = frame_covariance(pairs, 1.0, plant, sessions, sessions[0].start + 10 * DAY_S, 1e6, with_scale=False)
+    np.testing.assert_allclose(np.diag(cov)[3:], 0.03**2 / 3.0 / n, rtol=1e-3)
+    # a later session whose clusters have known velocities: flowers within clusters no longer help to turn it
+    b = np.repeat(a, 2, axis=0) + np.tile([[0.02, 0.0, 0.01], [-0.02, 0.0, -0.01]], (n, 1))
+    two = Pairs(b, b, np.full(2 * n, 1e-6), np.repeat(np.arange(n), 2), np.zeros(n))
+    later = sessions[0].start + 10 * DAY_S
+    second = [sessions[0], replace(sessions[0], start=sessions[0].start + DAY_S)]
+    grown = frame_covariance(two, 1.0, plant, second, later, 1e6, with_scale=False)
+    wide = replace(two, var_offset=np.full(n, 0.03**2 / 3.0), variance=two.variance * 100.0)
+    np.testing.assert_allclose(grown, pose_covariance(wide, 1.0, with_scale=False), rtol=1e-3, atol=1e-12)
+    assert (
+        np.diag(grown)[:3]
+        > 1.05 * np.diag(frame_covariance(two, 1.0, plant, sessions, later, 1e6, with_scale=False))[:3]
+    ).all()
