@@ -53,8 +53,25 @@ def test_depth_taken_for_range_is_found_and_undone() -> None:
     np.testing.assert_allclose(back.points, frames.points, atol=1e-12)
     u = frames.points / np.linalg.norm(frames.points, axis=1)[:, None]
     factor = np.einsum("ni,nij,nj->n", u, back.covs, u) / np.einsum("ni,nij,nj->n", u, frames.covs, u)
-    np.testing.assert_allclose(factor, found.along**2)
+    r = np.linalg.norm(frames.points, axis=1)
+    expected = np.minimum(found.along * (r / found.middle_m) ** found.growth, 1.0)
+    np.testing.assert_allclose(factor, expected**2, rtol=0.05)  # ranges before and after the correction
     assert 0.2 < found.along < 0.8  # stated 0.1 m, true 0.02 m, and twice that for what repeats
+    assert found.growth < 0.3
+
+
+def test_noise_that_grows_with_the_range_is_found() -> None:
+    frames, T, _ = _drive(1, 1e-3)
+    r = np.linalg.norm(frames.points, axis=1)
+    u = frames.points / r[:, None]
+    error = 0.004 * r**1.5 * np.random.default_rng(2).standard_normal(len(r))
+    cosine = u[:, 2]
+    short = replace(frames, points=(frames.points + error[:, None] * u) * cosine[:, None])
+    found = calibrate(short, T, ParticleConfig())
+    assert found.growth == pytest.approx(1.5, abs=0.25)
+    stated = np.sqrt(np.einsum("ni,nij,nj->n", u, frames.covs, u))
+    at_middle = 2.0 * 0.004 * found.middle_m**1.5 / np.median(stated)  # twice, for what repeats
+    assert found.along == pytest.approx(at_middle, rel=0.2)
 
 
 @pytest.mark.parametrize("quarters", [-3, 4])

@@ -34,6 +34,7 @@ _LEAST_GAIN = 10.0  # log-likelihood that a correction must bring
 _FEWEST_PAIRS, _MOST_PAIRS = 100, 20_000
 _SLOW = 2.0  # errors that repeat within a piece are so much larger than those that do not
 _N_ROUNDS = 3
+_N_RANGES = 6  # parts of equally many pairs, by range
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +42,17 @@ class Calibration:
     """Errors of the instruments: ``lag_s`` by which odometry is ahead, ``power`` of the cosine in ranges.
 
     A point at distance r and angle a off the axis was given at r cos(a)**power. ``along`` is the factor on the stated
-    sigma along the ray that the corrected points ask for, at most one.
+    sigma along the ray that the corrected points ask for at the range ``middle_m``; it grows with the power ``growth``
+    of the range, up to one. ``scale_sigma``: pieces tell how ranges depend
+    on the angle, not where on the picture they are right, so all lengths may be wrong by the mean correction.
     """
 
     lag_s: float = 0.0
     power: float = 0.0
     along: float = 1.0
+    growth: float = 0.0
+    middle_m: float = 1.0
+    scale_sigma: float = 0.0
 
     def in_words(self) -> tuple[str, ...]:
         """What was found to be wrong, for people."""
@@ -60,7 +66,8 @@ class Calibration:
         """The points where they are, with the noise that is left."""
         r = np.linalg.norm(frames.points, axis=1)
         u = frames.points / r[:, None]
-        squeeze = np.eye(3) + (self.along - 1.0) * u[:, :, None] * u[:, None]
+        along = np.minimum(self.along * (r / self.middle_m) ** self.growth, 1.0)
+        squeeze = np.eye(3) + (along - 1.0)[:, None, None] * u[:, :, None] * u[:, None]
         return replace(
             frames, points=frames.points * self._stretch(frames)[:, None], covs=squeeze @ frames.covs @ squeeze
         )
@@ -88,7 +95,7 @@ def calibrate(frames: Frames, given: Array, config: ParticleConfig) -> Calibrati
         return found
     usual = float(np.median(np.diff(frames.stamps)))
     for _ in range(_N_ROUNDS):
-        now = replace(found, along=1.0)
+        now = Calibration(found.lag_s, found.power)
         piece = follow_points(now.correct(frames), delayed(given, frames.stamps, found.lag_s), _PATIENCE * usual)
         a, b = pairs_of(frames, piece, _SPAN * usual)
         if len(a) < _FEWEST_PAIRS:
@@ -105,8 +112,8 @@ def calibrate(frames: Frames, given: Array, config: ParticleConfig) -> Calibrati
             return float(_errors(frames, given, replace(now, lag_s=lag), a, b)[1].mean())
 
         now = replace(now, lag_s=_believed(across, _LAG_STEPS * usual, n))
-        found = replace(now, along=_left_along(frames, given, now, a, b) if power else 1.0)
-    return found
+        found = _with_noise_left(frames, given, now, a, b) if power else now
+    return replace(found, scale_sigma=abs(float(np.log(found._stretch(frames)).mean())))
 
 
 def _believed(error: Callable[[float], float], limit: float, n: int) -> float:
@@ -122,13 +129,19 @@ def _believed(error: Callable[[float], float], limit: float, n: int) -> float:
     return float(best.x) if gain > _LEAST_GAIN else 0.0
 
 
-def _left_along(frames: Frames, given: Array, now: Calibration, a: IntArray, b: IntArray) -> float:
-    """Factor on the stated sigma along the ray, from the spread of corrected points in pieces."""
+def _with_noise_left(frames: Frames, given: Array, now: Calibration, a: IntArray, b: IntArray) -> Calibration:
+    """The same with the noise along the ray that the spread of corrected points in pieces shows, by range."""
     error = _errors(frames, given, now, a, b)[0]
-    u = frames.points[b] / np.linalg.norm(frames.points[b], axis=1)[:, None]
+    r = np.linalg.norm(frames.points[b], axis=1)
+    u = frames.points[b] / r[:, None]
     stated = np.sqrt(np.einsum("ni,nij,nj->n", u, frames.covs[b], u))
-    sigma = 1.4826 * float(np.median(np.abs(error / stated))) / np.sqrt(2.0)
-    return float(min(1.0, _SLOW * sigma))
+    parts = np.array_split(np.argsort(r), _N_RANGES)
+    middle = np.array([np.median(r[p]) for p in parts])
+    factor = 1.4826 / np.sqrt(2.0) * np.array([np.median(np.abs(error[p] / stated[p])) for p in parts])
+    growth = float(np.clip(np.polyfit(np.log(middle), np.log(np.maximum(factor, 1e-6)), 1)[0], 0.0, 2.0))
+    at = float(np.exp(np.log(middle).mean()))
+    along = _SLOW * float(np.exp(np.log(np.maximum(factor, 1e-6)).mean()))
+    return replace(now, along=along, growth=growth, middle_m=at)
 
 
 def _errors(frames: Frames, given: Array, now: Calibration, a: IntArray, b: IntArray) -> tuple[Array, Array]:

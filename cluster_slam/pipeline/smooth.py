@@ -25,7 +25,7 @@ from cluster_slam.smoothing.rounds import (
     settle,
     solve,
 )
-from cluster_slam.smoothing.world import World, corrected, for_solving, learn, with_variances
+from cluster_slam.smoothing.world import World, corrected, for_solving, learn, with_unknown_scale, with_variances
 
 Progress = Callable[[str, float], None]
 
@@ -81,7 +81,7 @@ def smooth(
     if world.errs_slowly:  # all observations of a flower say the same: its place is as uncertain as one of them
         smoother.correlation = float(np.bincount(smoother.landmark, minlength=1).max())
     _, smoother.poses = with_variances(stated, stated_poses, world.noise)
-    marginals = smoother.marginals(estimate)
+    marginals = with_unknown_scale(smoother.marginals(estimate), estimate, world.instruments, session.noise)
     clock.lap("smoothing")
     return make_result(session, frames, world, smoother, estimate, marginals, config, seed, merged, clock.laps)
 

@@ -10,9 +10,9 @@ from cluster_slam.association.calibration import Calibration, delayed
 from cluster_slam.association.frames import Frames
 from cluster_slam.config import SmoothConfig
 from cluster_slam.geometry import Array
-from cluster_slam.graph.batch import BatchSmoother, Estimate, PoseModel
+from cluster_slam.graph.batch import BatchSmoother, Estimate, Marginals, PoseModel
 from cluster_slam.graph.variance import VarianceFactors, variance_factors
-from cluster_slam.records import IntArray
+from cluster_slam.records import IntArray, StatedNoise
 
 NO_WEIGHT = 1e6  # observations that must not bend the trajectory count as one in so many
 
@@ -64,6 +64,21 @@ def learn(world: World, smoother: BatchSmoother, estimate: Estimate) -> World:
         found = VarianceFactors(1.0, 1.0, NO_WEIGHT)  # slow errors hide from residuals: the stated ones stay
     noise = VarianceFactors(world.noise.flower * found.flower, world.noise.pose * found.pose, found.correlation)
     return replace(world, T=estimate.T, X=estimate.X, places=estimate.places, noise=noise)
+
+
+def with_unknown_scale(
+    marginals: Marginals, estimate: Estimate, instruments: Calibration, noise: StatedNoise
+) -> Marginals:
+    """Covariances that hold although lengths of odometry and of ranges may be wrong by a common factor.
+
+    Residuals cannot show it. Odometry may be wrong by what it is stated to err per metre, ranges by their correction;
+    the factor moves all places from where the session began.
+    """
+    if instruments.scale_sigma == 0.0 or noise.odometry_translation == 0.0:
+        return marginals
+    precision = instruments.scale_sigma**-2 + noise.odometry_translation**-2
+    away = (estimate.places - estimate.T[0, :3, 3]).ravel()
+    return replace(marginals, places=marginals.places + np.outer(away, away) / precision)
 
 
 def fewest_observations(frames: Frames, config: SmoothConfig) -> int:
