@@ -66,12 +66,12 @@ def test_noise_that_grows_with_the_range_is_found() -> None:
     u = frames.points / r[:, None]
     error = 0.004 * r**1.5 * np.random.default_rng(2).standard_normal(len(r))
     cosine = u[:, 2]
-    short = replace(frames, points=(frames.points + error[:, None] * u) * cosine[:, None])
+    round_covs = np.broadcast_to(0.1**2 * np.eye(3), frames.covs.shape)
+    short = replace(frames, points=(frames.points + error[:, None] * u) * cosine[:, None], covs=round_covs)
     found = calibrate(short, T, ParticleConfig())
     assert found.growth == pytest.approx(1.5, abs=0.25)
-    stated = np.sqrt(np.einsum("ni,nij,nj->n", u, frames.covs, u))
-    at_middle = 2.0 * 0.004 * found.middle_m**1.5 / np.median(stated)  # twice, for what repeats
-    assert found.along == pytest.approx(at_middle, rel=0.2)
+    at_middle = 2.0 * 0.004 * found.middle_m**1.5 / 0.1  # twice, for what repeats
+    assert found.along == pytest.approx(at_middle, rel=0.3)  # points a of the pairs are from other ranges
 
 
 @pytest.mark.parametrize("quarters", [-3, 4])
