@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from tracking.motion import MotionConfig, MotionKind, advance, amplitude, process_noise, state_at_rest
+from tracking.motion import (
+    MotionConfig,
+    MotionKind,
+    advance,
+    amplitude,
+    process_noise,
+    state_at_rest,
+    touch_noise,
+)
 
 CONFIG = MotionConfig()
 ANCHOR = np.array([0.3, -0.2, 1.1])
@@ -71,3 +79,21 @@ def test_process_noise_is_a_covariance() -> None:
         for dt in (1e-3, 0.033, 0.4):
             Q = process_noise(state(0.03, 0.2, 2.0), dt, ANCHOR, kind, CONFIG)
             assert np.linalg.eigvalsh(Q)[0] >= -1e-18
+
+
+def test_unrest_scales_accelerations_of_sway_only() -> None:
+    x = state(0.03, 0.2, 2.0)
+    for kind, times in ((MotionKind.SWAY, 9.0), (MotionKind.REST, 1.0)):
+        usual, wild = (process_noise(x, 0.03, ANCHOR, kind, CONFIG, unrest) for unrest in (1.0, 3.0))
+        assert wild[:6, :6] == pytest.approx(times * usual[:6, :6])
+        assert wild[6:, 6:] == pytest.approx(usual[6:, 6:])
+
+
+def test_a_touch_is_a_velocity_for_a_part_of_the_time() -> None:
+    rng = np.random.default_rng(3)
+    v = rng.normal(size=200_000) * CONFIG.touch_speed
+    moved = v * rng.uniform(0.0, 0.05, len(v))
+    sampled = np.cov(moved, v)
+    N = touch_noise(0.05, CONFIG)
+    assert N[::3, ::3] == pytest.approx(sampled, rel=0.03)
+    assert N[0, 4] == 0.0

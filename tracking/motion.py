@@ -34,8 +34,9 @@ class MotionConfig:
     sway_hz: float = 1.3  # centre of the natural frequencies of stems (0.5 to 3 Hz)
     sway_log_sigma: float = 0.5  # one sigma of its logarithm: the range above within two
     damping: float = 0.1  # share of critical damping, usual for plants in leaf
-    sway_spread: float = 0.12  # share of the spring's acceleration that damping and shape leave unknown
-    sway_accel: float = 0.15  # m/s^2, gusts on a group that hardly moves
+    sway_spread: float = 0.05  # share of the spring's acceleration that is unknown: damping wrong by half ...
+    sway_accel: float = 0.05  # m/s^2, ... and gusts on a group that hardly moves; ``unrest`` makes both larger
+    touch_speed: float = 0.25  # m/s, one sigma an axis of what a touch adds to the velocity
     growth_accel: float = 1e-5  # m/s^2, how quickly growth changes
     scale_walk: float = 0.002  # per sqrt(s), of the logarithm of scale
     frequency_walk: float = 0.05  # per sqrt(s), of the logarithm of frequency
@@ -66,8 +67,13 @@ def advance(x: Array, dt: float, anchor: Array, kind: MotionKind, config: Motion
     return out
 
 
-def process_noise(x: Array, dt: float, anchor: Array, kind: MotionKind, config: MotionConfig) -> Array:
-    """Covariance (8, 8) of what ``advance`` does not know, for one state (8,)."""
+def process_noise(
+    x: Array, dt: float, anchor: Array, kind: MotionKind, config: MotionConfig, unrest: float = 1.0
+) -> Array:
+    """Covariance (8, 8) of what ``advance`` does not know, for one state (8,).
+
+    ``unrest``: how many times larger than usual the unknown accelerations of sway have proved to be.
+    """
     Q = np.zeros((N_STATES, N_STATES))
     Q[6, 6] = config.scale_walk**2 * dt
     Q[7, 7] = config.frequency_walk**2 * dt
@@ -78,12 +84,21 @@ def process_noise(x: Array, dt: float, anchor: Array, kind: MotionKind, config: 
         return Q
     accel = config.growth_accel
     if kind is MotionKind.SWAY:
-        accel = np.hypot(config.sway_accel, config.sway_spread * np.exp(2.0 * x[7]) * amplitude(x, anchor))
+        accel = unrest * np.hypot(config.sway_accel, config.sway_spread * np.exp(2.0 * x[7]) * amplitude(x, anchor))
     q = accel * accel
     Q[axes, axes] = q * dt**4 / 3.0
     Q[axes, axes + 3] = Q[axes + 3, axes] = q * dt**3 / 2.0
     Q[axes + 3, axes + 3] = q * dt**2
     return Q
+
+
+def touch_noise(dt: float, config: MotionConfig) -> Array:
+    """Covariance (6, 6) that a touch within the last ``dt`` seconds adds to position and velocity.
+
+    A velocity v ~ N(0, touch_speed^2) for a time t, uniform in (0, dt): E[t^2] = dt^2 / 3, E[t] = dt / 2.
+    """
+    shares = np.array([[dt * dt / 3.0, dt / 2.0], [dt / 2.0, 1.0]])
+    return np.kron(shares, np.eye(3)) * config.touch_speed**2
 
 
 def amplitude(x: Array, anchor: Array) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from cluster_slam.descriptors import inertia_and_mean_distance
 from cluster_slam.geometry import Array
 from cluster_slam.records import State
-from tracking.motion import MotionConfig, MotionKind, advance, amplitude, process_noise, state_at_rest
+from tracking.motion import MotionConfig, MotionKind, advance, amplitude, process_noise, state_at_rest, touch_noise
 from tracking.ukf import Innovation, UnscentedFilter
 
 _LONG_S = 0.5  # a prediction over longer knows no phase
@@ -22,13 +22,15 @@ _NAP_S = 0.5  # a cluster at rest is put through its filter this often
 WAKE_M = 0.004  # how far a cluster is from rest that begins to move, one sigma
 _TOUCHED = 0.005  # probability that a cluster at rest is touched between two measurements
 _CALMED = 0.03  # that one that sways has come to rest
+_NOTICED = 2.0  # intervals of frames after which a touch is noticed
 _SURE = 3.0  # log odds at which the motion is switched
 _MOST = 8.0  # log-likelihood ratio that one measurement may have: gates let wrong ones through
 _LEAN_S = 5.0  # over which the mean displacement at rest is taken
 _LEANING = 4.0  # times the trembling
 _UNSEEN_M = 0.002  # a cluster that is not looked at may have been moved so far, one sigma ...
 _UNSEEN_S = 5.0  # ... after so long
-_PUSHED_NIS = 25.0  # of three degrees of freedom: something pushed it again
+_LEARN = 0.1  # how quickly the unrest follows the innovations ...
+_MOST_UNREST = 10.0  # ... and how far
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +60,7 @@ class ClusterTrack:
         self.anchor_cov: Array = 1e-6 * np.eye(3)
         self.filter: UnscentedFilter | None = None
         self.trembling: tuple[Array, Array] | None = None  # at rest: displacement and covariance when last seen
+        self.unrest = 1.0  # times that accelerations are larger than usual, by the innovations
         self.last_nis = float("nan")
         self.last_shape = -np.inf
         self.lean, self.lean_s = np.zeros(3), 0.0  # mean displacement while at rest, and over how long
@@ -127,7 +130,7 @@ class ClusterTrack:
         if dt > _LONG_S and kind is not MotionKind.GROWTH:
             self._predict_far(f, anchor, dt)
         else:
-            Q = process_noise(f.x, dt, anchor, kind, config)
+            Q = process_noise(f.x, dt, anchor, kind, config, self.unrest)
             f.predict(lambda s: advance(s, dt, anchor, kind, config), Q)
         self.stamp = stamp
 
@@ -147,20 +150,22 @@ class ClusterTrack:
             self._switch(MotionKind.REST, "its sway has died away unseen")
         f.reset(rest, P)
 
-    def weigh(self, at_rest: float, waking: float, shift: Array, cov: Array) -> None:
+    def weigh(self, at_rest: float, waking: float, shift: Array, cov: Array, dt: float) -> None:
         """Weigh the evidence for sway against rest; switch when it is clear, before any update is made.
 
         ``at_rest`` and ``waking`` are the log-likelihoods of where it was seen if it rests and if it begins to move;
-        ``shift`` (3,) from where it was predicted, with ``cov`` (3, 3).
+        ``shift`` (3,) from where it was predicted, with ``cov`` (3, 3), ``dt`` s after it was last seen.
         """
         f = self.filter
         if f is None or self.anchor is None:
             return
-        moving = waking
+        moving, is_pushed = waking, False
         if self.is_moving:
             S = f.P[:3, :3] + cov
-            self.last_nis = float(shift @ np.linalg.solve(S, shift))
-            moving = -0.5 * (self.last_nis + float(np.linalg.slogdet(S)[1]))
+            self.last_nis, moving = _nis_and_log_likelihood(shift, S)
+            _, pushed = _nis_and_log_likelihood(shift, S + touch_noise(dt, self.config)[:3, :3])
+            is_pushed = pushed - moving > np.log(1.0 / _TOUCHED - 1.0)
+            moving = max(moving, pushed) if is_pushed else moving
         p = 1.0 / (1.0 + np.exp(-min(max(self.log_odds, -30.0), 30.0)))
         p = p * (1.0 - _CALMED) + (1.0 - p) * _TOUCHED
         self.log_odds = float(np.log(p / (1.0 - p))) + min(max(moving - at_rest, -_MOST), _MOST)
@@ -169,21 +174,23 @@ class ClusterTrack:
             x[6:], P[6, 6], P[7, 7] = f.x[6:], f.P[6, 6], f.P[7, 7]
             f.reset(x, P)
             self._switch(MotionKind.SWAY, f"it stands {1e3 * float(np.linalg.norm(shift)):.1f} mm from rest")
-            self._loosen(f)
+            self._loosen(f, _NOTICED * dt)
         elif self.is_moving and self.log_odds < -_SURE:
             self._switch(MotionKind.REST, "it has come to rest")
             x, P = state_at_rest(self.anchor, self.config)
             x[6:], P[6, 6], P[7, 7] = f.x[6:], f.P[6, 6], f.P[7, 7]
             f.reset(x, P)
-        elif self.is_moving and self.last_nis > _PUSHED_NIS:
+        elif is_pushed:
             self.why = "it was pushed again"
-            self._loosen(f)
+            self._loosen(f, dt)
+        elif self.is_moving:
+            surprise = min(self.last_nis / 3.0 - 1.0, 2.0)
+            self.unrest = float(np.clip(self.unrest * np.exp(_LEARN * surprise), 1.0, _MOST_UNREST))
 
-    def _loosen(self, f: UnscentedFilter) -> None:
-        """Anything may have happened to its velocity."""
+    def _loosen(self, f: UnscentedFilter, dt: float) -> None:
+        """Something touched it within the last ``dt`` seconds."""
         P = f.P.copy()
-        P[:3, :3] += 1e-6 * np.eye(3)
-        P[3:6, 3:6] += 0.15**2 * np.eye(3)
+        P[:6, :6] += touch_noise(dt, self.config)
         f.reset(f.x, P)
 
     def rest(self, u: Array, dt: float, stamp: float) -> None:
@@ -251,8 +258,14 @@ class ClusterTrack:
         self._switch(MotionKind.SWAY, reason)
 
     def _switch(self, kind: MotionKind, reason: str) -> None:
-        self.kind, self.why, self.trembling = kind, reason, None
+        self.kind, self.why, self.trembling, self.unrest = kind, reason, None, 1.0
         self.log_odds = _SURE if kind is MotionKind.SWAY else -_SURE
+
+
+def _nis_and_log_likelihood(shift: Array, S: Array) -> tuple[float, float]:
+    """Squared Mahalanobis length of an innovation (3,) with covariance (3, 3) and log-likelihood."""
+    nis = float(shift @ np.linalg.solve(S, shift))
+    return nis, -0.5 * (nis + float(np.linalg.slogdet(S)[1]))
 
 
 _WIDEST = 0.7  # log scale

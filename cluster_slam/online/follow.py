@@ -36,7 +36,8 @@ def follow(world: World, seen: Seen, w: Array, S: Array, stamp: float) -> None:
         cluster.trembling = None
     for k, slot in enumerate(pose.slots.tolist()):
         cluster = world.clusters[slot]
-        cluster.weigh(float(at_rest[k]), float(waking[k]), pose.shift[k], pose.shift_cov[k])
+        since = stamp - cluster.last
+        cluster.weigh(float(at_rest[k]), float(waking[k]), pose.shift[k], pose.shift_cov[k], since)
         cluster.awaken(stamp)
         if cluster.wants_filter(stamp):
             mine = np.flatnonzero(slots == slot) if cluster.wants_shape(stamp) else mine_not
@@ -44,7 +45,7 @@ def follow(world: World, seen: Seen, w: Array, S: Array, stamp: float) -> None:
             cluster.update(at.anchor[slot] + u[k], pose.shift_cov[k], shape, stamp)
         if not cluster.is_moving:
             cluster.trembling = rest_d[k], rest_P[k]
-            cluster.rest(u[k], stamp - cluster.last, stamp)
+            cluster.rest(u[k], since, stamp)
         cluster.last = stamp
         cluster.n += int(n_seen[slot])
 
