@@ -72,6 +72,10 @@ class Calibration:
             frames, points=frames.points * self._stretch(frames)[:, None], covs=squeeze @ frames.covs @ squeeze
         )
 
+    def without_growth(self) -> Calibration:
+        """The same with the usual noise at all ranges: too wide close by, where sharp points lead a search astray."""
+        return replace(self, growth=0.0)
+
     def _stretch(self, frames: Frames) -> Array:
         cosine = frames.points[:, 2] / np.linalg.norm(frames.points, axis=1)
         stretch: Array = np.clip(cosine, 0.2, 1.0) ** -self.power

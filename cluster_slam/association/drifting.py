@@ -73,10 +73,14 @@ def trace_drifting(
     rng : for the particles.
     """
     calibration = calibrate(frames, given, config)
-    seen, late = calibration.correct(frames), delayed(given, frames.stamps, calibration.lag_s)
-    tracer = _Tracer(seen, late, steps_of(late, cov_step, frames.stamps, config), config, rng)
-    best = _anchored(tracer.redo(tracer.price(tracer.assemble())), given[0])
-    weights = DriftSmoother(seen, tracer.steps, config.point_dof).step_weights(best.T)
+    late = delayed(given, frames.stamps, calibration.lag_s)
+    steps = steps_of(late, cov_step, frames.stamps, config)
+    rough = _Tracer(calibration.without_growth().correct(frames), late, steps, config, rng)  # it takes wrong turns less
+    start = rough.price(rough.assemble())
+    seen = calibration.correct(frames)
+    tracer = _Tracer(seen, late, steps, config, rng)
+    best = _anchored(tracer.redo(tracer.price(start)), given[0])
+    weights = DriftSmoother(seen, steps, config.point_dof).step_weights(best.T)
     scaled = cov_step * (config.odometry_scale**2 / weights)[:, None, None]
     return Traced(best.T, best.label, best.places, scaled, best.cost, calibration)
 
