@@ -42,6 +42,12 @@ def identities(store: MapStore, table: str, what: str, session: int) -> IntArray
     return np.array(rows, dtype=np.int64)
 
 
+def all_missed(true_ids: IntArray, known: dict[int, int]) -> Confusion:
+    """A session that was refused: all that the map had is missed."""
+    there = np.isin(true_ids[true_ids >= 0], list(known.values()))
+    return Confusion(missed=int(there.sum()), new=int((~there).sum()))
+
+
 def run_season(folder: Path, config: SeasonConfig, options: MapConfig, *, seed: int) -> Season:
     """All days of a season into one map."""
     plant, out = SeasonPlant(config, seed=seed), Season()
@@ -55,8 +61,8 @@ def run_season(folder: Path, config: SeasonConfig, options: MapConfig, *, seed: 
             added = add(store, Incoming(rest.constellation, "result", str(day)), config=options)
             if added.session is None:
                 out.n_refused += 1
-                out.clusters += Confusion(missed=len(rest.true_clusters))
-                out.flowers += Confusion(missed=int((rest.true_flowers >= 0).sum()))
+                out.clusters += all_missed(rest.true_clusters, known[0])
+                out.flowers += all_missed(rest.true_flowers, known[1])
                 continue
             clusters = identities(store, "observations", "cluster", added.session.id)
             flowers = identities(store, "flower_observations", "flower", added.session.id)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cluster_slam.constellation.match import Found
-from cluster_slam.constellation.units import MATCH_FLOOR_M
+from cluster_slam.constellation.units import MATCH_FLOOR_M, log_ball
 from cluster_slam.geometry import Array
 from cluster_slam.records import Constellation, IntArray
 from tracking.assignment import assign
@@ -77,16 +77,47 @@ def _flower_ratios(session: Constellation, match: Found) -> Array:
     where, var = _expected(match)
     own = match.scale**2 * np.trace(session.flower_covs, axis1=1, axis2=2) / 3.0
     squared = ((points[:, None] - where) ** 2).sum(-1)
-    total = own[:, None] + var
     tail = TAIL_SHARE_SINGLE if match.single else TAIL_SHARE
-    log_density = np.logaddexp(
-        np.log1p(-tail) - 0.5 * squared / total - 0.5 * d * np.log(2 * np.pi * total),
-        np.log(tail) - 0.5 * squared / (TAIL**2 * total) - 0.5 * d * np.log(2 * np.pi * TAIL**2 * total),
-    )
+    log_density = _log_density(squared, own[:, None] + var, d, tail, TAIL)
+    if not match.single:
+        _without_themselves(match, points, own, log_density)
     seen = np.clip(scene.config.seen_share * match.plant.flower_presence, 1e-3, 0.999)
     null, prior = _strangers(session, match)
     ratios: Array = log_density + np.log(seen / (1 - seen)) - null[:, None] + prior
     return ratios
+
+
+def _log_density(squared: Array, var: Array, d: int, tail: float, factor: float) -> Array:
+    """Log of a Gaussian of this variance along each axis, with a share ``tail`` of one ``factor`` times as wide."""
+    wide = factor**2 * var
+    density: Array = np.logaddexp(
+        np.log1p(-tail) - 0.5 * squared / var - 0.5 * d * np.log(2 * np.pi * var),
+        np.log(tail) - 0.5 * squared / wide - 0.5 * d * np.log(2 * np.pi * wide),
+    )
+    return density
+
+
+def _without_themselves(match: Found, points: Array, own: Array, log_density: Array) -> None:
+    """Log densities of flowers by which their cluster was placed: from where the cluster's other flowers put it.
+
+    A flower that stands alone says nothing about itself: its cluster may have drifted as far as was expected, or wider.
+    """
+    scene, found, known = match.scene, match.best, match.scene.known
+    for k in range(len(found)):
+        q, u = found.query[k], found.known[k]
+        member = np.flatnonzero(found.partner[k] >= 0)
+        rows, theirs = scene.query.flower[q, member], np.flatnonzero(known.groups.mask[u])
+        matched = known.groups.points[u, found.partner[k, member]]
+        weight = 1.0 / (MATCH_FLOOR_M**2 + own[rows])
+        pull = weight[:, None] * (points[rows] - matched)
+        left = 1.0 / known.var_offset[u] + weight.sum() - weight
+        offset = (pull.sum(axis=0) - pull) / left[:, None]
+        residual = points[rows][:, None] - known.groups.points[u, theirs] - offset[:, None]
+        var = own[rows][:, None] + known.groups.variances[u, theirs] + 1.0 / left[:, None]
+        alone = len(member) == 1
+        tail, factor = (scene.config.wide_share, scene.config.wide) if alone else (TAIL_SHARE, TAIL)
+        columns = known.flower[u, theirs]
+        log_density[np.ix_(rows, columns)] = _log_density((residual**2).sum(-1), var, points.shape[1], tail, factor)
 
 
 def _expected(match: Found) -> tuple[Array, Array]:
@@ -123,7 +154,8 @@ def _strangers(session: Constellation, match: Found) -> tuple[Array, Array]:
         return alone, np.zeros((len(row), len(match.plant.flowers)))
     partner = np.full(len(session.cluster_ids), -1)
     partner[scene.query.cluster[found.query]] = scene.known.cluster[found.known]
-    beside = np.log(background.n_new) + background.log_density
+    hidden = len(match.plant.flowers) / max(len(match.plant.cluster_ids), 1) * (1.0 - scene.config.seen_share)
+    beside = np.log(background.n_new + hidden) + background.log_density
     null = np.where(partner[row] >= 0, np.maximum(beside, alone), alone)
     same = partner[row][:, None] == match.plant.flower_rows
     return null, np.where(same, 0.0, np.log(ELSEWHERE))
@@ -148,9 +180,35 @@ def _clusters(
         best = np.zeros(n)
         np.maximum.at(best, row, np.where(is_match, flower_probability, 0.0))
         return partner, np.where(partner >= 0, np.minimum(probability, best), 1.0 - best)
-    pairs, new, _ = association_probabilities(found.table)
-    table, fresh = np.zeros((n, m)), np.ones(n)
-    table[np.ix_(scene.query.cluster, scene.known.cluster)] = pairs
-    fresh[scene.query.cluster] = new
-    probability = np.where(partner >= 0, table[np.arange(n), partner] * pose_probability, fresh)
+    ratio = np.full((n, m), -np.inf)
+    ratio[np.ix_(scene.query.cluster, scene.known.cluster)] = np.logaddexp(found.table, _turned_over(match))
+    free = np.where((partner >= 0)[:, None] | np.isin(np.arange(m), partner), -np.inf, ratio)
+    a, b = assign(-free, 0.0)
+    partner[a] = b
+    pairs, new, _ = association_probabilities(ratio)
+    best = np.zeros(n)
+    mine = is_match & (match.plant.flower_rows[flower] == partner[row])
+    np.maximum.at(best, row[mine], flower_probability[mine])
+    probability = np.where(partner >= 0, np.maximum(pairs[np.arange(n), partner] * pose_probability, best), new)
     return partner, np.clip(probability, 0.0, 1.0)
+
+
+def _turned_over(match: Found) -> Array:
+    """Log likelihood ratios (q, u) that a cluster is a known one though none of its flowers is: all others are unseen.
+
+    Its n flowers are hidden so far, new or false, nu of which are expected there; with k known flowers and the variance
+    s^2 of a flower in its cluster, their mean lies N(0, s^2/n + s^2/k + drift) from the known ones'.
+    """
+    scene, found = match.scene, match.best
+    query, known, background = scene.query, scene.known, scene.background
+    d = query.centres.shape[1]
+    moved = found.pose.apply(query.centres)[0]
+    n, k = (np.maximum(u.groups.mask.sum(axis=1), 1) for u in (query, known))
+    inside = np.exp(-2.0 / d * (background.log_density + log_ball(d))) / (d + 2)
+    var = inside / n[:, None] + inside / k + known.var_offset
+    squared = ((moved[:, None] - known.centres) ** 2).sum(-1)
+    expected = background.n_new + k * (1.0 - scene.config.seen_share)
+    unseen = np.where(known.groups.mask, np.log1p(-np.clip(known.seen, 1e-3, 0.999)), 0.0).sum(axis=1)
+    log_density = -0.5 * squared / var - 0.5 * d * np.log(2 * np.pi * var)
+    ratio: Array = log_density + n[:, None] * np.log(expected) - expected + unseen
+    return ratio - background.log_group_density - scene.bonus[:, None]
