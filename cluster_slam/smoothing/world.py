@@ -13,6 +13,7 @@ from cluster_slam.geometry import Array
 from cluster_slam.graph.batch import BatchSmoother, Estimate, Marginals, PoseModel
 from cluster_slam.graph.variance import VarianceFactors, variance_factors
 from cluster_slam.records import IntArray, StatedNoise
+from cluster_slam.smoothing.depth_noise import at_expected_depth
 
 NO_WEIGHT = 1e6  # observations that must not bend the trajectory count as one in so many
 
@@ -32,6 +33,7 @@ class World:
     cov_step: Array | None = None  # (n - 1, 6, 6) of odometry, where following its drift has told more than is stated
     wild_share: float = 0.0  # of observations whose errors are several times what the others' are
     errs_slowly: bool = False  # errors of observations cannot be told from drift of the poses
+    depth: Array | None = None  # (m,) m, where the flowers of observations are; NaN where that is not known
     instruments: Calibration = field(default_factory=Calibration)  # what the session shows to be wrong with them
 
 
@@ -51,6 +53,8 @@ def for_solving(frames: Frames, model: PoseModel, world: World) -> tuple[Frames,
     The estimated poses' own errors look like motion there, and would pull it away (errors in variables).
     """
     frames, model = with_variances(frames, model, world.noise)
+    if world.depth is not None:
+        frames = at_expected_depth(frames, world.depth)
     free = np.eye(6) - world.held
     cov = free @ model.cov_hand_eye @ free + 1e-12 * world.held
     step = model.cov_step if world.cov_step is None else world.cov_step
@@ -63,7 +67,9 @@ def learn(world: World, smoother: BatchSmoother, estimate: Estimate) -> World:
     if world.errs_slowly:
         found = VarianceFactors(1.0, 1.0, NO_WEIGHT)  # slow errors hide from residuals: the stated ones stay
     noise = VarianceFactors(world.noise.flower * found.flower, world.noise.pose * found.pose, found.correlation)
-    return replace(world, T=estimate.T, X=estimate.X, places=estimate.places, noise=noise)
+    depth = np.full(smoother.m, np.nan)
+    depth[smoother.rows] = smoother.residuals(estimate)[1][:, 2]
+    return replace(world, T=estimate.T, X=estimate.X, places=estimate.places, noise=noise, depth=depth)
 
 
 def with_unknown_scale(

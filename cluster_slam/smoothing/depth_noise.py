@@ -1,0 +1,51 @@
+"""Noise of points at the depth where their flowers are, not at the depth where they were measured.
+
+A camera states the noise of a point at its measured depth, with which it grows. So points that were measured too near
+seem surer than points that were measured too far, and flowers come out too near: with sigma proportional to depth
+squared by 4 sigma^2 / z, which many views do not average away. The noise at the expected depth has no such bias.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from cluster_slam.association.frames import Frames
+from cluster_slam.geometry import Array
+
+_FEWEST = 50  # observations that tell how noise depends on depth
+_LEAST_SPREAD = 0.02  # of the logarithm of their depths
+_STEEPEST = 4.0  # power of depth
+_FARTHEST = 2.0  # times the measured depth: what is expected farther off is no error of depth
+
+
+def at_expected_depth(frames: Frames, depth: Array) -> Frames:
+    """The same with covariances as the session states them for points at ``depth`` (m,) m, NaN where none is known."""
+    along, across = powers_of_depth(frames)
+    known = np.isfinite(depth) & (frames.points[:, 2] > 0)
+    if (along == 0.0 and across == 0.0) or not known.any():
+        return frames
+    points = frames.points[known]
+    ratio = np.clip(depth[known] / points[:, 2], 1.0 / _FARTHEST, _FARTHEST)
+    u = points / np.linalg.norm(points, axis=1)[:, None]
+    stretch = (ratio**across)[:, None, None] * np.eye(3)
+    stretch = stretch + (ratio**along - ratio**across)[:, None, None] * u[:, :, None] * u[:, None]
+    covs = frames.covs.copy()
+    covs[known] = stretch @ covs[known] @ stretch
+    return replace(frames, covs=covs)
+
+
+def powers_of_depth(frames: Frames) -> tuple[float, float]:
+    """Powers of depth with which the stated sigma grows along the ray and across it; zeros where nothing tells."""
+    z = frames.points[:, 2]
+    ahead = z > 0
+    if ahead.sum() < _FEWEST or np.log(z[ahead]).std() < _LEAST_SPREAD:
+        return 0.0, 0.0
+    points, covs = frames.points[ahead], frames.covs[ahead]
+    u = points / np.linalg.norm(points, axis=1)[:, None]
+    along = np.einsum("mi,mij,mj->m", u, covs, u)
+    across = 0.5 * (np.trace(covs, axis1=1, axis2=2) - along)
+    x = np.log(z[ahead]) - np.log(z[ahead]).mean()
+    slopes = [float(x @ np.log(np.sqrt(var)) / (x @ x)) for var in (along, across)]
+    return float(np.clip(slopes[0], 0.0, _STEEPEST)), float(np.clip(slopes[1], 0.0, _STEEPEST))
