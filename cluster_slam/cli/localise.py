@@ -67,7 +67,8 @@ def command(
     options = configured(LocaliseConfig(), config, settings or [])
     opened = open_session(session, level=level)
     with open_map(map_file) as store:
-        plants = store.plants()
+        name = opened.plant
+        plants = [store.plant(name)] if name is not None and name in store.plant_names() else store.plants()
     with StageProgress(is_shown=not (quiet or as_json)) as progress:
         found = localise(
             opened,

@@ -75,7 +75,7 @@ class Follower:
         self.is_sure = False
         self._recent: list[tuple[int, int]] = []  # points, matched
         self._n_searched = 0
-        self.spacing = [_spacing(p) for p in localiser.plants]
+        self._spacing: dict[int, float] = {}
 
     def step(self, frame: int, look: Look) -> Place:
         """The next frame."""
@@ -177,7 +177,9 @@ class Follower:
         reach = float(np.linalg.norm(look.points, axis=1).mean()) if len(look) else 0.5
         P = c.track.pose_cov
         var = (np.trace(P[3:, 3:]) + reach**2 * np.trace(P[:3, :3])) / 3.0
-        return float(np.sqrt(max(var, 0.0)) / (0.5 * self.spacing[c.plant]))
+        if c.plant not in self._spacing:
+            self._spacing[c.plant] = _spacing(self.localiser.plants[c.plant])
+        return float(np.sqrt(max(var, 0.0)) / (0.5 * self._spacing[c.plant]))
 
     def _place(self, frame: int, look: Look, found: Localisation | None) -> Place:
         flowers, clusters = np.full(len(look), CLUTTER), np.full(len(look), CLUTTER)

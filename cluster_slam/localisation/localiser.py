@@ -10,6 +10,7 @@ import numpy as np
 from cluster_slam.config import LocaliseConfig
 from cluster_slam.errors import InputError
 from cluster_slam.geometry import Array, inverse, se3_log
+from cluster_slam.localisation.atlas import Atlas
 from cluster_slam.localisation.evidence import log_evidence, null_density
 from cluster_slam.localisation.fit import Fit, refine
 from cluster_slam.localisation.hypotheses import PlantIndex, distinct, rough_poses, sharpened
@@ -58,6 +59,10 @@ class Localisation:
 
 
 Plant = Landmarks | PlantMap
+_MOST_TRIED = 8  # plants that are searched one after the other; of more, those that the index of triples names
+_NEAR_SCORE = 1.5  # groups by which a plant that is looked at may be behind the first
+_MOST_THOROUGH = 2  # of many plants: those that are searched with all means where nothing is sure yet
+_MOST_READY = 64  # plants that are kept made ready
 
 
 class Localiser:
@@ -96,18 +101,37 @@ class Localiser:
             detection=self.config.detection,
             unmapped=self.config.unmapped,
         )
-        self.index = [PlantIndex(p, self._reach(p, point_sigma_m)) for p in self.plants]
+        self.point_sigma_m = point_sigma_m
+        self._ready: dict[int, PlantIndex] = {}
+        self.atlas = Atlas(self.plants, self._centroid_sigma()) if len(self.plants) > _MOST_TRIED else None
 
-    def _reach(self, marks: Landmarks, point_sigma_m: float) -> float:
+    def index(self, plant: int) -> PlantIndex:
+        """The plant made ready for the search; the ones asked for last are kept."""
+        if plant not in self._ready:
+            if len(self._ready) >= _MOST_READY:
+                del self._ready[next(iter(self._ready))]
+            self._ready[plant] = PlantIndex(self.plants[plant], self._reach(self.plants[plant]))
+        return self._ready[plant]
+
+    def _reach(self, marks: Landmarks) -> float:
         own = np.trace(marks.shared_covs, axis1=1, axis2=2).mean() / 3.0
-        return float(8.0 * np.sqrt(point_sigma_m**2 + own + self.config.sway_m**2))
+        return float(8.0 * np.sqrt(self.point_sigma_m**2 + own + self.config.sway_m**2))
+
+    def _centroid_sigma(self) -> float:
+        """How far a group of flowers is off an axis: by points, by sway, by what the map may be wrong by."""
+        own = np.median([np.trace(p.shared_covs, axis1=1, axis2=2).mean() / 3.0 for p in self.plants])
+        return float(np.sqrt(self.point_sigma_m**2 / 2.0 + own + self.config.sway_m**2))
 
     def locate(self, frame: Frame) -> Localisation:
         """Where a frame is seen from; its pose and stamp are not looked at."""
         return self.locate_points(frame.points, frame.covs)
 
-    def locate_points(self, points: Array, covs: Array, *, scale: ErrorScale | None = None) -> Localisation:
+    def locate_points(
+        self, points: Array, covs: Array, *, scale: ErrorScale | None = None, among: Sequence[int] | None = None
+    ) -> Localisation:
         """Where a frame with points (n, 3) and covariances (n, 3, 3) of the camera frame is seen from.
+
+        ``among``: the plants (indices) that are looked at; None: all, or in a map of many those that the index names.
 
         Raises
         ------
@@ -118,17 +142,26 @@ class Localiser:
         look = make_look(points, covs, scale)
         if len(look) < 3:
             return self._answer(look, [])
+        tried = self.likely_plants(look.points) if among is None else among
         for thorough in (False, True):
             found: list[Hypothesis] = []
-            for plant in range(len(self.plants)):
+            for plant in tried[:_MOST_THOROUGH] if thorough and self.atlas is not None else tried:
                 found += self._in_plant(look, plant, scale, thorough)
             weighed = self._weighed(found)
             if weighed and weighed[0].probability >= self.config.sure_probability:
                 break
         return self._answer(look, weighed)
 
+    def likely_plants(self, points: Array) -> Sequence[int]:
+        """Which plants (indices) points (n, 3) may show: all of a few; of many at most eight, the likeliest first."""
+        if self.atlas is None:
+            return range(len(self.plants))
+        found = self.atlas.guesses(points)
+        near = [g.plant for g in found if g.score > found[0].score - _NEAR_SCORE]
+        return list(dict.fromkeys(near))[:_MOST_TRIED]
+
     def _in_plant(self, look: Look, plant: int, scale: ErrorScale, thorough: bool) -> list[Hypothesis]:
-        index, marks = self.index[plant], self.plants[plant]
+        index, marks = self.index(plant), self.plants[plant]
         poses, scores = rough_poses(look, index, scale, self.config, thorough=thorough)
         if len(poses) == 0:
             return []

@@ -10,11 +10,12 @@ from time import perf_counter
 import numpy as np
 
 from cluster_slam.config import LocaliseConfig
-from cluster_slam.geometry import inverse, se3_exp, se3_log
+from cluster_slam.geometry import Array, inverse, se3_exp, se3_log
 from cluster_slam.localisation import Landmarks, Localisation, Localiser
 from cluster_slam.localisation.following import Follower, Place
 from cluster_slam.localisation.instruments import corrected
 from cluster_slam.localisation.learning import Seen, learn_scale
+from cluster_slam.localisation.merging import merged_points
 from cluster_slam.localisation.motion import Motion, motion_of
 from cluster_slam.localisation.planar import Flat, flat_world
 from cluster_slam.localisation.scene import ErrorScale, Look, make_look
@@ -24,6 +25,7 @@ from tracking.gating import chi2_threshold
 
 Progress = Callable[[str, float], None]
 _N_LEARNING = 40  # frames from which the errors' scale is learnt, spread over the session
+_N_TOGETHER = 10  # frames that tell which plant of many is in view
 _N_POSE_LEARNING = 150  # frames in a row from which the given poses' errors are learnt
 
 
@@ -67,6 +69,7 @@ def localise(
     ready = perf_counter()
     say("learning how large the errors are", 0.02)
     motion = motion_of(session)
+    frames.motion = None if independent or window == 1 else motion
     frames.learn()
     flat = None if independent or window else _flat_world(session, motion, localiser)
     if flat is not None:
@@ -100,7 +103,9 @@ class _Frames:
         self.session, self.localiser = session, localiser
         self.rows = _rows_of_frames(session)
         self.scale = localiser.errors
+        self.motion: Motion | None = None  # where frames may be taken together
         self._found: dict[int, Localisation] = {}
+        self._plant: int | None = None  # that was seen last
 
     def look(self, i: int, scale: ErrorScale | None = None) -> Look:
         o, rows = self.session.observations, self.rows[i]
@@ -110,8 +115,30 @@ class _Frames:
         """The frame by itself, with no prior."""
         if i not in self._found:
             o, rows = self.session.observations, self.rows[i]
-            self._found[i] = self.localiser.locate_points(o.points[rows], o.covs[rows], scale=self.scale)
+            for among in self._plants(i):
+                found = self.localiser.locate_points(o.points[rows], o.covs[rows], scale=self.scale, among=among)
+                self._found[i] = found
+                if found.is_located:
+                    self._plant = found.hypotheses[0].plant
+                    break
         return self._found[i]
+
+    def _plants(self, i: int) -> Iterator[Sequence[int] | None]:
+        """Plants among which a frame is looked for: all of a few; of many the last one, then those that it may show."""
+        if self.localiser.atlas is None:
+            yield None
+            return
+        if self._plant is not None:
+            yield [self._plant]
+        yield self.localiser.likely_plants(self._together(i))
+
+    def _together(self, i: int) -> Array:
+        """Points (n, 3) in the camera of frame i: its own, with those of the frames before where motion is known."""
+        if self.motion is None:
+            return self.look(i).points
+        motion, first = self.motion, max(0, i - _N_TOGETHER + 1)
+        steps = np.stack([motion.camera_step(i, k, motion.X0) for k in range(first, i + 1)])
+        return merged_points([self.look(k) for k in range(first, i + 1)], steps, self.scale.sway_m)
 
     def learn(self) -> None:
         """How large the errors are, from frames that are located for sure; twice, as gates follow from it."""
