@@ -200,10 +200,13 @@ class _How:
         from cluster_slam.io.result import write_result
         from cluster_slam.io.session import OBSERVED
         from cluster_slam.io.session_writer import observed_table
-        from cluster_slam.online.journal import journal_of
+        from cluster_slam.online.journal import journal_of, read_journal
+        from cluster_slam.pipeline.track import instants_of
         from cluster_slam.report.page import render_report
+        from cluster_slam.report.replay import with_replay
 
-        files: dict[str, str | bytes] = {"report.html": render_report(result, metrics)}
+        page = with_replay(render_report(result, metrics), result, instants_of(read_journal(journal_of(self.out))))
+        files: dict[str, str | bytes] = {"report.html": page}
         if metrics is not None:
             files["metrics.json"] = json.dumps(metrics.as_json(), indent=2, allow_nan=False) + "\n"
         if result.session.level == 1:  # what was detected, so that no picture need be opened again

@@ -107,15 +107,23 @@ class ClusterTrack:
             return self.config.tremble_m
         return max(amplitude(self.filter.x, self.anchor), self.config.tremble_m)
 
-    def now(self) -> tuple[Array, Array, Array]:
-        """Centroid (3,), velocity (3,), and their covariance (6, 6), the map's own with it."""
+    def now(self, stamp: float) -> tuple[Array, Array, Array]:
+        """Centroid (3,), velocity (3,), and their covariance (6, 6), the map's own with it; predicted if not seen."""
         anchor = np.zeros(3) if self.anchor is None else self.anchor
         cov = np.zeros((6, 6))
-        if self.is_moving and self.filter is not None:
-            position, velocity = self.filter.x[:3], self.filter.x[3:6]
-            cov[:] = self.filter.P[:6, :6]
+        f, dt = self.filter, stamp - self.stamp
+        if self.is_moving and f is not None:
+            x, P = f.x, f.P
+            if dt > 0.0 and self.kind is MotionKind.SWAY:
+                x, P, _ = self._far(f, anchor, dt)
+            elif dt > 0.0:
+                P = P + process_noise(x, dt, anchor, self.kind, self.config)
+                x = advance(x, dt, anchor, self.kind, self.config)
+            position, velocity = x[:3], x[3:6]
+            cov[:] = P[:6, :6]
         else:
-            d, P = self.trembling or (np.zeros(3), self.config.tremble_m**2 * np.eye(3))
+            is_fresh = self.trembling is not None and stamp <= self.last
+            d, P = self.trembling if self.trembling is not None and is_fresh else self.displacement(stamp)
             position, velocity = anchor + d, np.zeros(3)
             cov[:3, :3], cov[3:, 3:] = P, (self.config.tremble_m / self.config.tremble_s) ** 2 * np.eye(3)
         cov[:3, :3] += self.anchor_cov
@@ -135,20 +143,23 @@ class ClusterTrack:
         self.stamp = stamp
 
     def _predict_far(self, f: UnscentedFilter, anchor: Array, dt: float) -> None:
-        """Over a long time the phase of a sway is lost, and what is left of it may point anywhere."""
-        before, x = f.P, f.x.copy()
-        rest, P = state_at_rest(anchor, self.config)
-        omega = np.exp(x[7])
+        x, P, left = self._far(f, anchor, dt)
+        if self.is_moving and left < self.config.tremble_m:
+            self._switch(MotionKind.REST, "its sway has died away unseen")
+        f.reset(x, P)
+
+    def _far(self, f: UnscentedFilter, anchor: Array, dt: float) -> tuple[Array, Array, float]:
+        """State (8,) and covariance (8, 8) after a long time: no phase of a sway is known; how far it still swings."""
+        x, P = state_at_rest(anchor, self.config)
+        omega = np.exp(f.x[7])
         left = self.reach * np.exp(-self.config.damping * omega * dt) if self.is_moving else 0.0
         moved = _UNSEEN_M**2 * (1.0 - np.exp(-dt / _UNSEEN_S))
         P[:3, :3] += (left**2 + moved) * np.eye(3)
         P[3:6, 3:6] += (left**2 + moved) * omega**2 * np.eye(3)
-        P[6, 6] = before[6, 6] + self.config.scale_walk**2 * dt
-        P[7, 7] = min(before[7, 7] + self.config.frequency_walk**2 * dt, self.config.sway_log_sigma**2)
-        rest[6:] = x[6:]
-        if self.is_moving and left < self.config.tremble_m:
-            self._switch(MotionKind.REST, "its sway has died away unseen")
-        f.reset(rest, P)
+        P[6, 6] = f.P[6, 6] + self.config.scale_walk**2 * dt
+        P[7, 7] = min(f.P[7, 7] + self.config.frequency_walk**2 * dt, self.config.sway_log_sigma**2)
+        x[6:] = f.x[6:]
+        return x, P, float(left)
 
     def weigh(self, at_rest: float, waking: float, shift: Array, cov: Array, dt: float) -> None:
         """Weigh the evidence for sway against rest; switch when it is clear, before any update is made.

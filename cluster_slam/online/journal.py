@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cluster_slam.errors import InputError, OutputError
 from cluster_slam.geometry import tum_from_pose
-from cluster_slam.online.records import Revision, Update
+from cluster_slam.online.records import Revision, Tracks, Update
 
 if TYPE_CHECKING:
     from cluster_slam.online.tracker import OnlineTracker
@@ -31,7 +31,14 @@ _FRAMES = np.dtype([("stamp", "<f8"), ("pose", "<f8", 7)])
 _DRIFT = np.dtype([("frame", "<i4"), ("cluster", "<i4"), ("position", "<f8", 3), ("cov", "<f4", (3, 3))])
 _GIVEN = np.dtype([("pose", "<f8", (4, 4))])  # of a live frame: nobody else keeps what came in
 _POINTS = np.dtype([("point", "<f8", 3), ("cov", "<f8", (3, 3)), ("score", "<f8")])
-_TABLES = {"rows.bin": _ROWS, "frames.bin": _FRAMES, "drift.bin": _DRIFT, "given.bin": _GIVEN, "points.bin": _POINTS}
+_TRACKS = np.dtype(  # all clusters, seen or not, ten times a second: what an animated replay shows
+    [("frame", "<i4"), ("cluster", "<i4"), ("position", "<f4", 3), ("cov", "<f4", (3, 3)), ("what", "u1")]
+)
+_TABLES = {"rows.bin": _ROWS, "frames.bin": _FRAMES, "drift.bin": _DRIFT, "tracks.bin": _TRACKS}
+_TABLES |= {"given.bin": _GIVEN, "points.bin": _POINTS}
+TENTATIVE, CONFIRMED, LOST, SWAYING, SEEN = 0, 1, 2, 4, 8  # bits of ``what``
+_STATES = {"tentative": TENTATIVE, "confirmed": CONFIRMED, "lost": LOST}
+_TRACKS_S = 0.1
 _TEXTS = ("revisions.txt", "warnings.txt")
 _OURS = ("cluster_slam.online.", "cluster_slam.graph.incremental", "cluster_slam.config", "cluster_slam.records")
 _PLAIN = {"list", "dict", "set", "frozenset", "tuple", "int", "float", "bool", "slice", "range", "deque", "bytearray"}
@@ -53,6 +60,7 @@ class Told:
     rows: NDArray[Any]
     frames: NDArray[Any]
     drift: NDArray[Any]
+    tracks: NDArray[Any]
     given: NDArray[Any]
     points: NDArray[Any]
     revisions: tuple[str, ...]
@@ -71,7 +79,7 @@ class Journal:
     def __init__(self, out: Path, session_id: str, *, n_frames: int = 0) -> None:
         """``n_frames`` are there already, if a run that was cut off goes on."""
         self.folder, self.session_id, self.n_frames = journal_of(out), session_id, n_frames
-        self._last_mark = -np.inf
+        self._last_mark = self._last_tracks = -np.inf
         try:
             if not n_frames and self.folder.exists():
                 shutil.rmtree(self.folder)
@@ -116,6 +124,9 @@ class Journal:
         self._append("rows.bin", rows.tobytes())
         self._append("frames.bin", frame.tobytes())
         self._append("drift.bin", drift.tobytes())
+        if at - self._last_tracks >= _TRACKS_S or at < self._last_tracks:
+            self._append("tracks.bin", _tracks(i, tracks).tobytes())
+            self._last_tracks = at
         self._append("revisions.txt", "".join(_line(at, r) for r in update.revisions).encode())
         self._append("warnings.txt", "".join(f"{at:.6f} {w}\n" for w in update.warnings).encode())
         self.n_frames += 1
@@ -148,6 +159,19 @@ class Journal:
             raise OutputError(f"{self.folder / name}: cannot be written ({error.strerror})") from None
 
 
+def _tracks(i: int, tracks: Tracks) -> NDArray[Any]:
+    rows = np.zeros(len(tracks), _TRACKS)
+    rows["frame"], rows["cluster"] = i, tracks.ids
+    rows["position"], rows["cov"] = tracks.positions, tracks.covs[:, :3, :3]
+    bits = [
+        _STATES[state] | SWAYING * (motion != "rest")
+        for state, motion in zip(tracks.states, tracks.motions, strict=True)
+    ]
+    rows["what"] = np.array(bits, dtype=np.uint8) | SEEN * (tracks.seen > 0).astype(np.uint8)
+    told: NDArray[Any] = rows[rows["what"] & 3 != TENTATIVE]
+    return told
+
+
 def read_journal(folder: Path) -> Told:
     """The tables of a journal; what was cut off in the middle of a row is left out."""
     tables = []
@@ -155,7 +179,7 @@ def read_journal(folder: Path) -> Told:
         content = (folder / name).read_bytes()
         tables.append(np.frombuffer(content[: len(content) // kind.itemsize * kind.itemsize], kind))
     texts = [tuple((folder / name).read_text("utf-8", "replace").splitlines()) for name in _TEXTS]
-    return Told(tables[0], tables[1], tables[2], tables[3], tables[4], texts[0], texts[1])
+    return Told(tables[0], tables[1], tables[2], tables[3], tables[4], tables[5], texts[0], texts[1])
 
 
 def resume(out: Path, session_id: str) -> tuple[OnlineTracker, int]:

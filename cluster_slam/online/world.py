@@ -65,15 +65,6 @@ class World:
         zero = np.zeros(3)
         return np.array([zero if k.anchor is None else k.anchor for k in self.clusters]).reshape(-1, 3)
 
-    def covs_at_rest(self) -> Array:
-        """Covariances (c, 6, 6) of position and velocity of clusters of which nothing is known but that they rest."""
-        m, n = self.motion, len(self.clusters)
-        covs = np.zeros((n, 6, 6))
-        covs[:] = np.diag(np.repeat([m.tremble_m, m.tremble_m / m.tremble_s], 3) ** 2)
-        if n:
-            covs[:, :3, :3] += np.array([k.anchor_cov for k in self.clusters])
-        return covs
-
     def snapshot(self, stamp: float) -> Snapshot:
         """The clusters as predicted; moving ones must have been brought to this time."""
         n = len(self.clusters)

@@ -17,12 +17,13 @@ from cluster_slam.geometry import Array
 from cluster_slam.live.replay import Replay
 from cluster_slam.live.view import FrameSource, Notice
 from cluster_slam.online.intake import usable_points
-from cluster_slam.online.journal import Journal, Told
+from cluster_slam.online.journal import CONFIRMED, LOST, SEEN, SWAYING, Journal, Told
 from cluster_slam.online.journal import resume as resume_journal
 from cluster_slam.online.records import Update
 from cluster_slam.online.result import make_result
 from cluster_slam.online.tracker import OnlineTracker
 from cluster_slam.records import Calibration, Frame, Observations, Result, Session
+from cluster_slam.report.replay import Instants
 
 Progress = Callable[[str, float], None]
 _NO_POINTS = "rows that are no points were left out"
@@ -175,6 +176,21 @@ def _session_of(header: Session, said: Told) -> Session:
     )
     stamps, poses = said.frames["stamp"].copy(), said.given["pose"].copy()
     return replace(header, stamps=stamps, poses=poses, observations=observations)
+
+
+def instants_of(said: Told) -> Instants:
+    """All clusters ten times a second, for the report's replay."""
+    rows = said.tracks
+    what = rows["what"].astype(np.int64)
+    return Instants(
+        frame=rows["frame"].astype(np.int64),
+        cluster=rows["cluster"].astype(np.int64),
+        position=rows["position"].astype(np.float64),
+        cov=rows["cov"].astype(np.float64),
+        state=what & (CONFIRMED | LOST),
+        sways=(what & SWAYING) // SWAYING,
+        seen=(what & SEEN) // SEEN,
+    )
 
 
 def _begin(
