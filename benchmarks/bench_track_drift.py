@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from bench_track import calibration_of
+from figure import Figure
 
 from cluster_slam.live.replay import Replay
 from cluster_slam.online import OnlineTracker
@@ -118,6 +119,19 @@ def hidden(seed: int) -> tuple[int, int]:
             total += 1
             right += int(np.bincount(names_after).argmax()) == name_before
     return right, total
+
+
+def measure(quick: bool) -> list[Figure]:
+    """Error of the prediction over that of "stays", in swings of more than a centimetre."""
+    if quick:
+        return []
+    nis, ahead, still = (np.array(part) for part in drift(31))
+    return [
+        Figure("track: mean NIS of swaying clusters over 3", float(nis.mean()) / 3.0, ""),
+        Figure(
+            "track: error one frame ahead over that of staying", float(np.sqrt(ahead.mean() / still.mean())), "", 0.5
+        ),
+    ]
 
 
 def main() -> None:
