@@ -10,6 +10,7 @@ import numpy as np
 from cluster_slam.config import MapConfig
 from cluster_slam.geometry import inverse, se3_log, transform
 from cluster_slam.io.map import create_map
+from cluster_slam.io.map.check import problems
 from cluster_slam.io.map.incoming import Incoming
 from cluster_slam.io.map.store import MapStore
 from cluster_slam.pipeline.remember import add
@@ -30,6 +31,7 @@ class Season:
     unvisited_presence: list[float] = field(default_factory=list)
     reliability: list[tuple[float, bool]] = field(default_factory=list)  # probability of a match, and is it right
     n_refused: int = 0
+    problems: list[str] = field(default_factory=list)  # of the map at the end
 
 
 def identities(store: MapStore, table: str, what: str, session: int) -> IntArray:
@@ -91,4 +93,5 @@ def run_season(folder: Path, config: SeasonConfig, options: MapConfig, *, seed: 
             if first is not None:
                 out.clusters, out.flowers = out.clusters + scores[0], out.flowers + scores[1]
             first = first or rest
+        out.problems += problems(store)
     return out

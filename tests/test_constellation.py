@@ -20,7 +20,8 @@ from cluster_slam.constellation.similarity import align
 from cluster_slam.geometry import Array, inverse, se3_exp, se3_log, so3_exp, transform
 from cluster_slam.records import Constellation, PlantMap
 from cluster_slam.remember.decide import Refusal, decide
-from cluster_slam.remember.update import aligned, empty_plant, update
+from cluster_slam.remember.tables import aligned, empty_plant
+from cluster_slam.remember.update import update
 from cluster_slam.simulate.config import SimulateConfig
 from cluster_slam.simulate.season import SEASON, SeasonPlant
 

@@ -269,6 +269,22 @@ def test_events_stay_with_their_cluster(tmp_path: Path) -> None:
             undo(store)  # the session that brought cluster 3
 
 
+def test_events_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with map_of(tmp_path, grown()) as store:
+        path = str(store.path)
+    assert run(["map", "event", path, "3", "pollinated", "--time", "2026-05-06", "--note", "brush", "--json"]) == 0
+    done = json.loads(capsys.readouterr().out)
+    assert (done["map_id"], done["time"], done["note"]) == (3, seconds("2026-05-06"), "brush")
+    assert run(["map", "event", path, "--json"]) == 0
+    assert [e["event"] for e in json.loads(capsys.readouterr().out)["events"]] == [done["event"]]
+    assert run(["map", "event", path, "3", "--delete", str(done["event"])]) == 2  # which of the two?
+    assert run(["map", "event", path, "--delete", str(done["event"]), "--quiet"]) == 0
+    assert run(["map", "event", path, "--delete", str(done["event"]), "--quiet"]) == 2
+    assert run(["map", "event", path, "999", "note", "--quiet"]) == 2
+    with open_map(path) as store:
+        assert events(store) == []
+
+
 def test_dates() -> None:
     assert seconds("1970-01-02") == 86400.0
     assert seconds("1970-01-01T01:00+01:00") == 0.0
@@ -290,8 +306,26 @@ def test_merge(tmp_path: Path) -> None:
         assert set(one.plant("a").flower_ids.tolist()).isdisjoint(one.plant("b").flower_ids.tolist())
         assert events(one)[0].cluster == one.plant("b").cluster_ids[1]
         assert problems(one) == []
-        with pytest.raises(InputError, match="in both maps"):
+        with pytest.raises(InputError, match="is in both maps"):
             merge_map(one, two)
+
+
+def test_merge_of_plants_of_one_name(tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    with map_of(tmp_path, grown(), "a") as one, map_of(tmp_path / "other", grown(5), "a") as two:
+        before = dump(one)
+        with pytest.raises(InputError, match="--rename a=NEW"):
+            merge_map(one, two)
+        with pytest.raises(InputError, match="no plant 'x' to rename"):
+            merge_map(one, two, names={"x": "y"})
+        assert dump(one) == before
+    path, other = str(tmp_path / "a.map"), str(tmp_path / "other" / "a.map")
+    assert run(["map", "merge", path, other, "--quiet"]) == 2
+    assert run(["map", "merge", path, other, "--rename", "a", "--quiet"]) == 2
+    assert run(["map", "merge", path, other, "--rename", "a=b", "--quiet"]) == 0
+    with open_map(path) as store:
+        assert store.plant_names() == ["a", "b"]
+        assert problems(store) == []
 
 
 # --- faults

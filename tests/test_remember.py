@@ -9,10 +9,16 @@ from pathlib import Path
 import numpy as np
 from map_help import map_of, rest_incoming
 
+from cluster_slam.config import MapConfig
 from cluster_slam.constellation.fit import Pairs, pose_covariance
 from cluster_slam.constellation.growth import DAY_S
+from cluster_slam.constellation.identify import Identities
+from cluster_slam.io.map import open_map
+from cluster_slam.pipeline.remember import add
 from cluster_slam.remember.gauge import frame_covariance
 from cluster_slam.remember.predict import learned_seen_share, membership_cov
+from cluster_slam.remember.tables import aligned
+from cluster_slam.remember.update import update
 from cluster_slam.simulate.config import SimulateConfig
 from cluster_slam.simulate.season import SEASON, SeasonPlant
 
@@ -61,9 +67,6 @@ def test_the_share_of_flowers_that_are_seen_is_learned(tmp_path: Path) -> None:
         assert learned_seen_share(store.plant("row3"), 0.85) == 0.85
     hidden = SeasonPlant(replace(config, unseen_share=0.5), seed=3)
     hidden.grow_to(0.0)
-    from cluster_slam.io.map import open_map
-    from cluster_slam.pipeline.remember import add
-
     second = rest_incoming(hidden).constellation
     second = replace(second, session="second", start=second.start + DAY_S, end=second.end + DAY_S)
     with open_map(tmp_path / "row3.map") as store:
@@ -93,3 +96,26 @@ def test_the_frame_is_as_sure_as_the_mean_drift(tmp_path: Path) -> None:
         np.diag(grown)[:3]
         > 1.05 * np.diag(frame_covariance(two, 1.0, plant, sessions, later, 1e6, with_scale=False))[:3]
     ).all()
+
+
+def test_a_cluster_whose_flowers_all_changed(tmp_path: Path) -> None:
+    """It is seen, not missed, and stands where it was expected at the later time."""
+    plant = SeasonPlant(replace(SEASON, session=SimulateConfig(n_clusters=12)), seed=2)
+    with map_of(tmp_path, plant) as store:
+        known = store.plant("row3")
+    first = rest_incoming(plant).constellation
+    later = replace(first, start=first.start + DAY_S, end=first.end + DAY_S)
+    rows = np.arange(len(first.flowers))
+    other = first.flower_cluster_ids == 2
+    n = len(first.cluster_ids)
+    who = Identities(np.arange(n), np.ones(n), np.where(other, -1, rows), np.ones(len(rows)))
+    where = aligned(later, np.eye(4), 1.0)
+    after = update(known, later, where, who, np.ones(len(rows), dtype=bool), MapConfig(), 100, 1000)
+    assert len(after.missed) == 0
+    assert after.cluster_map_ids.tolist() == known.cluster_ids.tolist()
+    assert after.flower_map_ids[other].min() == 1000
+    np.testing.assert_array_equal(after.plant.cluster_time, later.start)
+    np.testing.assert_array_equal(after.plant.cluster_last_seen, later.start)
+    grown = np.trace(after.plant.cluster_covs[2] - known.cluster_covs[2])
+    assert 0.9 * 0.003**2 < grown < 2.0 * 0.003**2  # a day's drift is in its covariance
+    assert after.plant.flower_presence[: len(rows)][known.flower_cluster_ids == known.cluster_ids[2]].max() < 1.0

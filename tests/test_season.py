@@ -45,6 +45,7 @@ def test_a_hard_season(tmp_path: Path) -> None:
     assert found.clusters.f1 >= 0.95
     assert found.flowers.f1 >= 0.9
     assert found.clusters.wrong_share <= 0.02
+    assert found.problems == []
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])

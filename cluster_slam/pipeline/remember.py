@@ -20,7 +20,8 @@ from cluster_slam.records import Constellation, PlantMap
 from cluster_slam.remember.decide import Decision, Refusal, decide
 from cluster_slam.remember.gauge import frame_covariance
 from cluster_slam.remember.looked import looked_at
-from cluster_slam.remember.update import aligned, empty_plant, update
+from cluster_slam.remember.tables import aligned, empty_plant
+from cluster_slam.remember.update import update
 
 Progress = Callable[[str, float], None]
 FAR_M = 100.0  # no plant is so large

@@ -38,3 +38,9 @@ def iso(time: float | None) -> str:
     if time is None or time != time:
         return ""
     return datetime.fromtimestamp(time, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def minutes(time: float | None) -> str:
+    """Unix time as a date and a time of day to the minute, in UTC, for a table."""
+    text = iso(time)
+    return f"{text[:10]} {text[11:16]}" if text else "no date"
