@@ -68,6 +68,14 @@ def test_files_are_those_of_the_format(folder: Path, tmp_path: Path) -> None:
     assert record["command"] == "localise"
     assert record["counts"]["located"] == len(located)
     assert (out / "hypotheses.csv").read_text().startswith("timestamp,rank,probability,tx,ty,tz,qx,qy,qz,qw\n")
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["located"] == len(located) / len(rows)
+    shift = np.linalg.norm(xi[:, 3:], axis=1)
+    assert metrics["is_aligned"] or metrics["ate_rmse_m"] == pytest.approx(np.sqrt((shift**2).mean()))
+    assert metrics["flower_idf1"] > 0.95
+    assert b"<svg" in (out / "localisation.svg").read_bytes()
+    again = run(["localise", str(folder / "session"), "-m", str(folder / "session.map"), "-o", str(out), "-q"])
+    assert again == 0  # in place of the earlier result, picture and all
 
 
 def test_another_plants_map_gives_no_place_and_says_so(

@@ -62,6 +62,7 @@ def command(
     from cluster_slam.io.result import check_output
     from cluster_slam.io.session import open_session
     from cluster_slam.pipeline.localise import localise
+    from cluster_slam.report.localised import localisation_picture
 
     check_output(out)
     options = configured(LocaliseConfig(), config, settings or [])
@@ -80,18 +81,33 @@ def command(
             seed=seed,
             progress=progress,
         )
-        write_localisation(found, out)
+        metrics = _metrics(found, session)
+        extra: dict[str, str | bytes] = {"localisation.svg": localisation_picture(found, plants)}
+        if metrics:
+            extra["metrics.json"] = json.dumps(metrics, indent=2, allow_nan=False) + "\n"
+        write_localisation(found, out, extra_files=extra)
     if as_json:
-        print_json({**json.loads((out / "run.json").read_text("utf-8")), "out": str(out)})
+        print_json({**json.loads((out / "run.json").read_text("utf-8")), "metrics": metrics, "out": str(out)})
     elif not quiet:
-        _tell(found, out)
+        _tell(found, metrics, out)
     if found.status == "poor":
         print_warnings([f"the result is poor: {'; '.join(found.warnings)}"])
     return 0 if found.status == "ok" else 1
 
 
-def _tell(found: SessionLocalisation, out: Path) -> None:
+def _metrics(found: SessionLocalisation, session: Path) -> dict[str, float | bool]:
+    """What the truth says of it, where the session has one."""
+    from cluster_slam.evaluation.localised import evaluate_localisation
+    from cluster_slam.io.session import open_truth
+
+    truth = open_truth(session, found.session)
+    return {} if truth is None else evaluate_localisation(found, truth).as_json()
+
+
+def _tell(found: SessionLocalisation, metrics: dict[str, float | bool], out: Path) -> None:
     import numpy as np
+
+    from cluster_slam.cli.summary import shown_metric
 
     print_warnings(found.warnings if found.status == "ok" else ())
     n, located = found.session.n_frames, int(found.is_located.sum())
@@ -106,4 +122,6 @@ def _tell(found: SessionLocalisation, out: Path) -> None:
         var = np.nanmedian(np.diagonal(found.covs[found.is_located], axis1=1, axis2=2), axis=0)
         turn, shift = np.degrees(np.sqrt(var[:3].sum())), 1e3 * np.sqrt(var[3:].sum())
         rows.append(("sure to (one sigma, median)", f"{shift:.2f} mm, {turn:.3f} deg"))
+    words = ", ".join(f"{name} {shown_metric(name, float(value))}" for name, value in metrics.items())
+    rows += [("against the truth", words)] if metrics else []
     print_table(f"cluster-slam localise: {found.status}", [*rows, ("result", str(out))])

@@ -123,7 +123,7 @@ class _Level:
     def _look_up(self, seen: Groups, corners: IntArray, sides: Array, width: float) -> list[Guess]:
         """The best poses that a few triples (b, 3) of the look give."""
         keys = np.hstack([sides, seen.sizes[corners]]) / self.scale
-        hits = self.keys.query_ball_point(keys, width, p=np.inf)
+        hits = np.asarray(self.keys.query_ball_point(keys, width, p=np.inf), dtype=object).tolist()
         out: list[Guess] = []
         left = _MOST_POSES
         for k in np.argsort([len(h) for h in hits], kind="stable").tolist():
