@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cluster_slam.records import IntArray
+from cluster_slam.records import BoolArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Confusion:
         return (self.wrong + self.joined) / total if total else 0.0
 
 
-def confusion(true_ids: IntArray, map_ids: IntArray, is_new: IntArray, known: dict[int, int]) -> Confusion:
+def confusion(true_ids: IntArray, map_ids: IntArray, is_new: IntArray | BoolArray, known: dict[int, int]) -> Confusion:
     """Score one session, and remember what its new ones are.
 
     Parameters

@@ -5,7 +5,10 @@ from __future__ import annotations
 import html
 import json
 import re
+from collections.abc import Sequence
+from dataclasses import asdict
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,21 +18,28 @@ from cluster_slam.io.map.ledger import Event, events, state_of
 from cluster_slam.io.map.store import MapStore, StoredSession
 from cluster_slam.io.map.times import iso
 from cluster_slam.records import PlantMap
+from cluster_slam.remember.judge import Verdict, judge
 
 DAY_S = 86400.0
 _DIGITS = 5
 
 
-def render_season(store: MapStore, plant: str | None = None) -> str:
+def render_season(store: MapStore, plant: str | None = None, truth: Sequence[Path] = ()) -> str:
     """The page of a map, of one plant or of all, as one HTML text.
+
+    Parameters
+    ----------
+    truth
+        The results of all sessions of the map, where these have truth: the page then says how good the map is.
 
     Raises
     ------
     InputError
-        There is no plant of this name.
+        There is no plant of this name, or a session without truth among those with it.
     """
     names = store.plant_names() if plant is None else [store.plant(plant).name]
-    data = {"map": store.path.name, "plants": [_plant(store, name) for name in names]}
+    judged = [asdict(verdict) | _rates(verdict) for verdict in judge(store, truth)] if truth else []
+    data = {"map": store.path.name, "plants": [_plant(store, name) for name in names], "judged": judged}
     asset = resources.files("cluster_slam.report").joinpath("assets")
     parts = {
         "title": html.escape(f"{store.path.name}: season"),
@@ -39,6 +49,10 @@ def render_season(store: MapStore, plant: str | None = None) -> str:
     }
     page = asset.joinpath("season.html").read_text("utf-8")
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], page)
+
+
+def _rates(verdict: Verdict) -> dict[str, float]:
+    return {"f1": verdict.confusion.f1, "wrong_share": verdict.confusion.wrong_share}
 
 
 def _plant(store: MapStore, name: str) -> dict[str, Any]:

@@ -63,10 +63,21 @@ def report(
     path: MapArgument,
     out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE.html", help="Page to write.", show_default=False)],
     plant: PlantOption = None,
+    truth: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--truth",
+            metavar="RESULT",
+            help="A result that was added, of a session with truth; all of them.",
+            show_default=False,
+        ),
+    ] = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> int:
     """Write the season report: plants in 3-D by date, life lines, drift, events, each alignment before and after.
+
+    With the results of all sessions as --truth (of sessions that have one) it says how good re-identification was.
 
     Example: cluster-slam map report field.map -o season.html
     """
@@ -74,6 +85,6 @@ def report(
     from cluster_slam.report.season import render_season
 
     with opened(path) as store:
-        write_file(out, render_season(store, plant))
+        write_file(out, render_season(store, plant, truth or ()))
     tell("cluster-slam map report", {"out": str(out)}, [("page", str(out))], quiet=quiet, as_json=as_json)
     return 0

@@ -127,6 +127,49 @@
     box.replaceChildren(...lines.map((t) => cell("p", t)));
   }
 
+  const KINDS = ["clusters", "flowers"];
+
+  function table(id, head, rows) {
+    const line = (tag, texts) => { const tr = document.createElement("tr"); tr.append(...texts.map((t) => cell(tag, t))); return tr; };
+    at(id).replaceChildren(line("th", head), ...rows.map((r) => line("td", r)));
+  }
+
+  function interval(bin) {
+    const z = 1.96, n = bin.n, middle = (bin.right + z * z / (2 * n)) / (1 + z * z / n);
+    const half = z * Math.sqrt(bin.right * (1 - bin.right) / n + z * z / (4 * n * n)) / (1 + z * z / n);
+    return [Math.max(0, middle - half), Math.min(1, middle + half)];
+  }
+
+  function drawReliability() {
+    const view = canvas("reliability"), g = view.g, side = Math.min(view.width - 60, view.height - 40);
+    const x = (p) => 45 + p * side, y = (p) => view.height - 30 - p * side;
+    g.strokeStyle = g.fillStyle = colour("--soft"); g.font = "12px sans-serif"; g.lineWidth = 1;
+    g.strokeRect(x(0), y(1), side, side);
+    g.beginPath(); g.moveTo(x(0), y(0)); g.lineTo(x(1), y(1)); g.stroke();
+    for (const v of [0, 0.5, 1]) { g.fillText(String(v), x(v) - 8, y(0) + 16); g.fillText(String(v), x(0) - 26, y(v) + 4); }
+    g.fillText("said", x(0.5) + 14, y(0) + 16); g.save(); g.translate(12, y(0.6)); g.rotate(-Math.PI / 2); g.fillText("right", -8, 0); g.restore();
+    let k = 0;
+    data.judged.forEach((verdict, kind) => ["matches", "new"].forEach((what) => {
+      g.strokeStyle = g.fillStyle = hue(k);
+      for (const b of verdict[what]) {
+        const [low, high] = interval(b);
+        g.beginPath(); g.moveTo(x(b.said), y(low)); g.lineTo(x(b.said), y(high)); g.stroke();
+        g.beginPath(); g.arc(x(b.said), y(b.right), 4, 0, 7); g.fill();
+      }
+      g.fillText(`${KINDS[kind]}, ${what === "new" ? "new" : "known again"}`, x(0) + 8, y(1) + 16 + 16 * k++);
+    }));
+  }
+
+  function drawJudged() {
+    at("judged").hidden = !data.judged.length;
+    if (!data.judged.length) return;
+    const names = ["right", "wrong", "missed", "joined", "new"], share = (v) => (100 * v).toFixed(2) + " %";
+    table("confusion", ["", "right", "wrong", "missed", "falsely joined", "rightly new", "F1", "wrong of all"], data.judged.map((v, k) => [KINDS[k], ...names.map((n) => String(v.confusion[n])), v.f1.toFixed(4), share(v.wrong_share)]));
+    const rows = data.judged.flatMap((v, k) => ["matches", "new"].flatMap((what) => v[what].map((b) => [KINDS[k], what === "new" ? "new" : "known again", b.said.toFixed(4), b.right.toFixed(4), String(b.n)])));
+    table("bins", ["", "said to be", "sure to", "right", "decisions"], rows);
+    drawReliability();
+  }
+
   function draw() {
     const p = plant();
     at("title").textContent = `${data.map}: ${p ? p.name : "empty"}`;
@@ -134,7 +177,7 @@
     at("says").textContent = `${p.sessions.length} sessions, ${p.clusters.length} clusters, ${p.flowers.length} flowers; clusters drift by ${p.drift_mm_per_day} mm a day (RMS).`;
     const s = p.sessions[state.day];
     at("when").textContent = s ? `${s.date || "no date"} (${s.id})` : "";
-    drawScene(); drawAlignment(); drawLives(); drawChosen();
+    drawScene(); drawAlignment(); drawLives(); drawChosen(); drawJudged();
   }
 
   function choose() {
