@@ -11,6 +11,7 @@ import numpy as np
 
 from cluster_slam.errors import InputError
 from cluster_slam.geometry import Array
+from cluster_slam.io.map.incoming import names_of
 from cluster_slam.io.map.store import MapStore, StoredSession
 from cluster_slam.io.run_record import read_run
 from cluster_slam.io.tables import read_table
@@ -69,7 +70,7 @@ def _true_ids(folder: Path) -> tuple[str, tuple[dict[int, int], dict[int, int]]]
     found = read_table(folder / "observations.csv", ("flower_id", "cluster_id"), ignored=("timestamp", "reason", "nis"))
     if len(true) != len(found):
         raise InputError(f"{path}: {len(true)} rows, expected {len(found)} as in {folder / 'observations.csv'}")
-    session = run.session or folder.resolve().name
+    session, _, _ = names_of(folder, run.session_path, run.session)
     columns = (
         (table.columns[name].astype(np.int64) for table in (found, true)) for name in ("cluster_id", "flower_id")
     )

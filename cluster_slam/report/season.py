@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from cluster_slam.geometry import inverse, transform
+from cluster_slam.geometry import inverse, skew, transform
 from cluster_slam.io.map.ledger import Event, events, state_of
 from cluster_slam.io.map.store import MapStore, StoredSession
 from cluster_slam.io.map.times import iso
@@ -74,7 +74,9 @@ def _session(store: MapStore, session: StoredSession) -> dict[str, Any]:
     seen = store.read("SELECT x, y, z FROM observations WHERE session_id = ? AND x IS NOT NULL", (session.id,))
     after = np.array(seen, dtype=float).reshape(-1, 3)
     before = transform(inverse(session.T_map_world), after)
-    sigma = np.sqrt(np.maximum(np.diag(session.cov), 0.0))
+    middle = before.mean(axis=0) if len(before) else np.zeros(3)
+    lever = np.vstack([np.eye(6)[:3], np.hstack([-skew(middle), np.eye(3)])])  # the pose at the plant's middle
+    sigma = np.sqrt(np.maximum(np.diag(lever @ session.cov @ lever.T), 0.0))
     return {
         "id": session.session,
         "date": iso(session.start),

@@ -52,7 +52,7 @@ def read_incoming(folder: str | Path) -> Incoming:
     if not folder.is_dir():
         raise InputError(f"{folder}: {'is a file' if folder.exists() else 'missing'}, expected a result folder")
     run = read_run(folder / "run.json")
-    session, plant, warnings = _names(folder, run.session_path, run.session)
+    session, plant, warnings = names_of(folder, run.session_path, run.session)
     flowers = read_table(
         folder / "flowers.csv", ["flower_id", "cluster_id", *_POINT, *POINT_COV, "first_seen", "last_seen"]
     )
@@ -73,7 +73,7 @@ def read_incoming(folder: str | Path) -> Incoming:
     return Incoming(constellation, "result", digest, seen, warnings)
 
 
-def _names(folder: Path, session_path: Path | None, session: str | None) -> tuple[str, str | None, tuple[str, ...]]:
+def names_of(folder: Path, session_path: Path | None, session: str | None) -> tuple[str, str | None, tuple[str, ...]]:
     """Id of the session and name of its plant, from the session's own metadata where it is still there."""
     if session_path is not None and (session_path / "session.toml").exists():
         metadata, _ = read_metadata(session_path / "session.toml")

@@ -86,7 +86,7 @@
     if (!s) return;
     for (const c of p.clusters) { const seen = lastSeen(c.life, state.day - 1); if (seen) map.push(seen.where.slice(0, 3)); }
     at("alignment").textContent = map.length
-      ? `${s.id}: sure to ${s.probability}; one sigma ${s.turn_deg} degrees, ${s.shift_mm} mm` + (s.scale !== 1 ? `; scale ${s.scale}` : "")
+      ? `${s.id}: sure to ${s.probability.toFixed(4)}; one sigma ${s.turn_deg} degrees, ${s.shift_mm} mm at the plant's middle` + (s.scale !== 1 ? `; scale ${s.scale}` : "")
       : "The first session makes the frame.";
     drawPoints("before", [{ points: map, colour: "--soft", filled: false }, { points: s.before, colour: "--c1", filled: true }], "before: as the base stood");
     drawPoints("after", [{ points: map, colour: "--soft", filled: false }, { points: s.after, colour: "--c0", filled: true }], "after: in the map (rings: where it was last)");
@@ -142,12 +142,15 @@
 
   function drawReliability() {
     const view = canvas("reliability"), g = view.g, side = Math.min(view.width - 60, view.height - 40);
-    const x = (p) => 45 + p * side, y = (p) => view.height - 30 - p * side;
+    const nines = (p) => Math.min(-Math.log10(Math.max(1 - p, 1e-9)), 4) / 4; // the last percent is what matters
+    const x = (p) => 60 + nines(p) * side, y = (p) => view.height - 30 - nines(p) * side;
     g.strokeStyle = g.fillStyle = colour("--soft"); g.font = "12px sans-serif"; g.lineWidth = 1;
     g.strokeRect(x(0), y(1), side, side);
     g.beginPath(); g.moveTo(x(0), y(0)); g.lineTo(x(1), y(1)); g.stroke();
-    for (const v of [0, 0.5, 1]) { g.fillText(String(v), x(v) - 8, y(0) + 16); g.fillText(String(v), x(0) - 26, y(v) + 4); }
-    g.fillText("said", x(0.5) + 14, y(0) + 16); g.save(); g.translate(12, y(0.6)); g.rotate(-Math.PI / 2); g.fillText("right", -8, 0); g.restore();
+    for (const v of [0, 0.9, 0.99, 0.999, 0.9999]) {
+      g.fillText(String(v), x(v) - 8, y(0) + 16); g.fillText(String(v), 18, y(v) + 4);
+    }
+    g.fillText("said", x(0.9) - 42, y(0) + 16); g.save(); g.translate(12, y(0.9)); g.rotate(-Math.PI / 2); g.fillText("right", -8, 0); g.restore();
     let k = 0;
     data.judged.forEach((verdict, kind) => ["matches", "new"].forEach((what) => {
       g.strokeStyle = g.fillStyle = hue(k);
