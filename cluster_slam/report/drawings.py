@@ -151,7 +151,8 @@ def draw_misfit(result: Result) -> Figure | None:
     right.plot([0, 1], [0, 1], color=_SOFT, lw=0.7, ls="--")
     for k, one in enumerate(coverage_curves(result, None)):
         right.fill_between(one.nominal, one.low, one.high, color=_BAND, lw=0)
-        right.plot(one.nominal, one.actual, color=PALETTE[k], marker=".", ms=3, label=one.name)
+        right.plot(one.nominal, one.actual, color=PALETTE[k], marker=".", ms=3, lw=0.8, label=one.name)
+    right.legend(loc="lower right", fontsize=6)
     right.set(xlabel="nominal probability", ylabel="share inside", xlim=(0, 1), ylim=(0, 1))
     right.set_aspect("equal")
     return figure

@@ -11,6 +11,7 @@ from cluster_slam.evaluation.landmarks import NOMINAL
 from cluster_slam.evaluation.trajectory import absolute_error
 from cluster_slam.geometry import Array, inverse, se3_log, transform
 from cluster_slam.records import CLUTTER, IntArray, RejectReason, Result
+from cluster_slam.report.gates import gate_tests
 from tracking.consistency import mean_band, share_band
 from tracking.gating import chi2_threshold
 
@@ -182,12 +183,13 @@ class CoverageCurve:
 
 
 def coverage_curves(result: Result, metrics: Metrics | None) -> tuple[CoverageCurve, ...]:
-    """Of the accepted detections, and against truth of flowers and clusters."""
-    nis = result.diagnostics.nis[np.isfinite(result.diagnostics.nis)]
-    curves = []
-    if len(nis) > len(result.flowers):
-        shares = tuple(float((nis <= chi2_threshold(3, p)).mean()) for p in NOMINAL)
-        curves.append(_coverage_curve("detections", shares, len(nis)))
+    """Of the gates' true matches, and against truth of flowers and clusters."""
+    curves = [
+        _coverage_curve(
+            f"{test.name} gate", tuple(float((test.probability <= p).mean()) for p in NOMINAL), len(test.probability)
+        )
+        for test in gate_tests(result)
+    ]
     if metrics is not None and metrics.coverage_flowers and metrics.n_flowers_compared:
         curves.append(_coverage_curve("flowers against truth", metrics.coverage_flowers, metrics.n_flowers_compared))
     if metrics is not None and metrics.coverage_clusters and metrics.n_clusters_compared:

@@ -72,7 +72,7 @@ function fillMisfit() {
 function fillCoverage() {
   if (!data.coverage.length) return;
   byId("coverage-title").hidden = false;
-  const colours = { detections: "--accent", "flowers against truth": "--c1", "clusters against truth": "--c2" };
+  const colours = { "position gate": "--accent", "descriptor gate": "--c4", "full geometry gate": "--c5", "flowers against truth": "--c1", "clusters against truth": "--c2" };
   const key = data.coverage.map((c) => {
     const sample = element("span", { class: "dot", colour: `var(${colours[c.name]})` });
     return element("li", {}, sample, `${c.name} (${whole(c.n)}): ${(100 * c.actual[9]).toFixed(1)} % inside 95 %`);
