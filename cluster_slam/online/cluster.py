@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from cluster_slam.records import State
 from tracking.motion import MotionConfig, MotionKind, advance, amplitude, process_noise, state_at_rest, touch_noise
 from tracking.ukf import Innovation, UnscentedFilter
 
+_EYE = np.eye(3)
 _LONG_S = 0.5  # a prediction over longer knows no phase
 _NAP_S = 0.5  # a cluster at rest is put through its filter this often
 WAKE_M = 0.004  # how far a cluster is from rest that begins to move, one sigma
@@ -87,9 +89,8 @@ class ClusterTrack:
         """Displacement from rest (3,) and covariance (3, 3), predicted for now (a moving one: at its filter's time)."""
         if self.is_moving and self.filter is not None and self.anchor is not None:
             return self.filter.x[:3] - self.anchor, self.filter.P[:3, :3]
-        unseen = max(stamp - self.last, 0.0)
-        var = self.config.tremble_m**2 + _UNSEEN_M**2 * (1.0 - np.exp(-unseen / _UNSEEN_S))
-        return np.zeros(3), var * np.eye(3)
+        var = self.config.tremble_m**2 + unseen_var(max(stamp - self.last, 0.0))
+        return np.zeros(3), np.asarray(var * _EYE)
 
     @property
     def scale(self) -> float:
@@ -153,7 +154,7 @@ class ClusterTrack:
         x, P = state_at_rest(anchor, self.config)
         omega = np.exp(f.x[7])
         left = self.reach * np.exp(-self.config.damping * omega * dt) if self.is_moving else 0.0
-        moved = _UNSEEN_M**2 * (1.0 - np.exp(-dt / _UNSEEN_S))
+        moved = unseen_var(dt)
         P[:3, :3] += (left**2 + moved) * np.eye(3)
         P[3:6, 3:6] += (left**2 + moved) * omega**2 * np.eye(3)
         P[6, 6] = f.P[6, 6] + self.config.scale_walk**2 * dt
@@ -271,6 +272,11 @@ class ClusterTrack:
     def _switch(self, kind: MotionKind, reason: str) -> None:
         self.kind, self.why, self.trembling, self.unrest = kind, reason, None, 1.0
         self.log_odds = _SURE if kind is MotionKind.SWAY else -_SURE
+
+
+def unseen_var(unseen_s: Any) -> Any:
+    """Variance, m^2, of how far a cluster at rest may have been moved while nobody looked, for so many seconds."""
+    return _UNSEEN_M**2 * (1.0 - np.exp(-unseen_s / _UNSEEN_S))
 
 
 def _nis_and_log_likelihood(shift: Array, S: Array) -> tuple[float, float]:

@@ -183,13 +183,16 @@ class OnlineTracker:
     def tracks(self, flower_ids: IntArray | None = None) -> Tracks:
         """All living clusters as they are now; ``flower_ids`` are those seen in this frame."""
         world, n = self.world, len(self.world.clusters)
-        now = [k.now(self.last_stamp) for k in world.clusters]
+        positions, velocities, covs = world.anchors(), np.zeros((n, 3)), world.covs_at_rest(self.last_stamp)
+        for j, k in enumerate(world.clusters):
+            if k.is_moving or k.trembling is not None:
+                positions[j], velocities[j], covs[j] = k.now(self.last_stamp)
         seen = np.isin(world.flowers.ids, np.zeros(0) if flower_ids is None else flower_ids)
         return Tracks(
             ids=world.names(),
-            positions=np.array([position for position, _, _ in now]).reshape(-1, 3),
-            velocities=np.array([velocity for _, velocity, _ in now]).reshape(-1, 3),
-            covs=np.array([cov for _, _, cov in now]).reshape(-1, 6, 6),
+            positions=positions,
+            velocities=velocities,
+            covs=covs,
             scales=np.array([k.scale for k in world.clusters]),
             states=tuple(k.state for k in world.clusters),
             motions=tuple(k.kind.value for k in world.clusters),

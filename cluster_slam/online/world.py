@@ -10,7 +10,7 @@ from cluster_slam.config import OnlineConfig
 from cluster_slam.geometry import Array, inverse, transform
 from cluster_slam.graph.incremental import IncrementalMap
 from cluster_slam.online.births import Births
-from cluster_slam.online.cluster import ClusterTrack
+from cluster_slam.online.cluster import ClusterTrack, unseen_var
 from cluster_slam.online.flowers import FlowerTable
 from cluster_slam.online.grouping import OnlineGrouping
 from cluster_slam.online.records import Revision, RevisionKind, Subject
@@ -64,6 +64,18 @@ class World:
         """Centroids at rest (c, 3)."""
         zero = np.zeros(3)
         return np.array([zero if k.anchor is None else k.anchor for k in self.clusters]).reshape(-1, 3)
+
+    def covs_at_rest(self, stamp: float) -> Array:
+        """Covariances (c, 6, 6) of position and velocity of clusters that rest, each the wider the longer unseen."""
+        m, n = self.motion, len(self.clusters)
+        last = np.array([k.last for k in self.clusters])
+        var = np.zeros((n, 6))
+        var[:, :3] = (m.tremble_m**2 + unseen_var(np.maximum(stamp - last, 0.0)))[:, None]
+        var[:, 3:] = (m.tremble_m / m.tremble_s) ** 2
+        covs = var[:, :, None] * np.eye(6)
+        if n:
+            covs[:, :3, :3] += np.array([k.anchor_cov for k in self.clusters])
+        return covs
 
     def snapshot(self, stamp: float) -> Snapshot:
         """The clusters as predicted; moving ones must have been brought to this time."""
