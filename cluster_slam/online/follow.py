@@ -8,7 +8,8 @@ from cluster_slam.association.frames import chi2_and_log_det, information, point
 from cluster_slam.geometry import Array, se3_exp, transform
 from cluster_slam.graph.incremental import FrameMatches
 from cluster_slam.online.associate import Seen, View
-from cluster_slam.online.cluster import WAKE_M, Shape, seen_shape
+from cluster_slam.online.cluster import WAKE_M
+from cluster_slam.online.shape import Shape, seen_shape
 from cluster_slam.online.world import World
 from cluster_slam.records import IntArray
 

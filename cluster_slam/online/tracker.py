@@ -14,7 +14,9 @@ from cluster_slam.online.associate import Seen, View, associate
 from cluster_slam.online.follow import follow, remember
 from cluster_slam.online.intake import Intake
 from cluster_slam.online.life import forget, live
+from cluster_slam.online.odometry import diagonal, step_cov
 from cluster_slam.online.records import Tracks, Update
+from cluster_slam.online.tracks import tracks_of
 from cluster_slam.online.upkeep import merge_doubles, regroup, solve_all, solve_near, tell_lost
 from cluster_slam.online.watch import MountWatch, NoiseWatch
 from cluster_slam.online.world import World
@@ -63,7 +65,7 @@ class OnlineTracker:
             sigma = np.maximum(np.repeat([n.hand_eye_rotation, n.hand_eye_translation], 3), 1e-7)
             self.cov_X, information = np.diag(sigma**2), np.diag(1.0 / sigma**2)
         self.world = World(self.config, information, seed)
-        self.cov_given = self._in_camera(_diagonal(n.pose_rotation, n.pose_translation))
+        self.cov_given = self._in_camera(diagonal(n.pose_rotation, n.pose_translation))
         self.intake = Intake()
         self.noise_watch, self.mount_watch = NoiseWatch(), MountWatch(self.cov_given)
         self.first_stamp = self.last_stamp = self.last_solve = self.last_all = self.last_group = -np.inf
@@ -131,16 +133,8 @@ class OnlineTracker:
         step = inverse(self.last_given) @ frame.pose
         D = inverse(X) @ step @ X
         back = adjoint(inverse(D))
-        return self.T @ D, back @ self.pose_cov @ back.T + self._step_cov(se3_log(step), dt)
-
-    def _step_cov(self, moved: Array, dt: float) -> Array:
-        """Covariance (6, 6) of one step of odometry, in the camera's frame; over a gap the way may have been longer."""
-        n = self.noise
-        times = float(np.sqrt(max(dt / max(self.world.usual_dt, 1e-9), 1.0)))
-        turned, travelled = (float(np.linalg.norm(part)) * times for part in (moved[:3], moved[3:]))
-        rotation = float(np.hypot(n.pose_rotation * times, n.odometry_rotation * turned))
-        along = float(np.hypot(n.pose_translation * times, n.odometry_translation * travelled))
-        return self._in_camera(_diagonal(rotation, float(np.hypot(along, rotation * travelled / np.sqrt(3.0)))))
+        gap = max(dt / max(self.world.usual_dt, 1e-9), 1.0)
+        return self.T @ D, back @ self.pose_cov @ back.T + self._in_camera(step_cov(self.noise, se3_log(step), gap))
 
     def _in_camera(self, cov: Array) -> Array:
         """A covariance (6, 6) of the given poses, moved into the camera's frame."""
@@ -182,24 +176,7 @@ class OnlineTracker:
 
     def tracks(self, flower_ids: IntArray | None = None) -> Tracks:
         """All living clusters as they are now; ``flower_ids`` are those seen in this frame."""
-        world, n = self.world, len(self.world.clusters)
-        positions, velocities, covs = world.anchors(), np.zeros((n, 3)), world.covs_at_rest(self.last_stamp)
-        for j, k in enumerate(world.clusters):
-            if k.is_moving or k.trembling is not None:
-                positions[j], velocities[j], covs[j] = k.now(self.last_stamp)
-        seen = np.isin(world.flowers.ids, np.zeros(0) if flower_ids is None else flower_ids)
-        return Tracks(
-            ids=world.names(),
-            positions=positions,
-            velocities=velocities,
-            covs=covs,
-            scales=np.array([k.scale for k in world.clusters]),
-            states=tuple(k.state for k in world.clusters),
-            motions=tuple(k.kind.value for k in world.clusters),
-            reasons=tuple(k.why for k in world.clusters),
-            n_flowers=np.bincount(world.flowers.slot, minlength=n),
-            seen=np.bincount(world.flowers.slot[seen], minlength=n),
-        )
+        return tracks_of(self.world, self.last_stamp, flower_ids)
 
     def _update(
         self,
@@ -270,7 +247,3 @@ class OnlineTracker:
             revisions=(),
             warnings=(f"frame refused: {reason}",),
         )
-
-
-def _diagonal(sigma_rotation: float, sigma_translation: float) -> Array:
-    return np.diag(np.maximum(np.repeat([sigma_rotation, sigma_translation], 3), 1e-7) ** 2)
