@@ -18,6 +18,7 @@ import pytest
 
 from cluster_slam import track
 from cluster_slam.cli.app import run
+from cluster_slam.errors import InputError
 from cluster_slam.io.session_writer import write_session
 from cluster_slam.live.replay import Replay
 from cluster_slam.live.view import Notice, NoticeKind
@@ -130,3 +131,11 @@ def test_a_robot_without_a_pose_costs_its_frames_only(tmp_path: Path, given: lis
     result = track_source(Source([*given[:20], *lost, *given[30:]]), tmp_path / "out")
     assert result.session.n_frames == len(given) - 10
     assert sum("pose is not finite" in text for text in result.warnings) == 1
+
+
+def test_a_mount_that_nobody_knows_is_refused(tmp_path: Path) -> None:
+    session = made().session
+    unknown = replace(session, noise=replace(session.noise, hand_eye_rotation=3.0, hand_eye_translation=1.0))
+    with pytest.raises(InputError, match=r"only known to 1 m and 3 rad, expected --calibration FILE"):
+        track(unknown, out=tmp_path / "out")
+    assert not list(tmp_path.iterdir())

@@ -12,7 +12,7 @@ from time import perf_counter, process_time
 import numpy as np
 
 from cluster_slam.config import OnlineConfig
-from cluster_slam.errors import ClusterSlamError
+from cluster_slam.errors import ClusterSlamError, InputError
 from cluster_slam.geometry import Array
 from cluster_slam.live.replay import Replay
 from cluster_slam.live.view import FrameSource, Notice
@@ -26,6 +26,7 @@ from cluster_slam.records import Calibration, Frame, Observations, Result, Sessi
 from cluster_slam.report.replay import Instants
 
 Progress = Callable[[str, float], None]
+_UNKNOWN_RAD, _UNKNOWN_M = 0.5, 0.5  # one sigma: beyond these it cannot be corrected step by step
 _NO_POINTS = "rows that are no points were left out"
 _MOST_WARNINGS = 200  # of a run of days, with a stamp in each
 
@@ -72,7 +73,7 @@ def track(
     StoppedError
         Somebody wanted it to stop; the journal holds what was tracked.
     InputError
-        There is nothing to resume, or of another session.
+        There is nothing to resume, or of another session; or nobody knows how the camera is mounted.
     OutputError
         The journal cannot be written.
     """
@@ -205,6 +206,7 @@ def _begin(
     if resume:
         return resume_journal(out, session.id)
     given = calibration if session.T_flange_camera is not None else None
+    _check_mount(session, given)
     tracker = OnlineTracker(
         session.noise,
         session.T_flange_camera,
@@ -214,6 +216,17 @@ def _begin(
         seed=seed,
     )
     return tracker, 0
+
+
+def _check_mount(session: Session, given: Calibration | None) -> None:
+    """Refuse a camera of which nobody knows how it is mounted: a live tracker cannot try all orientations."""
+    n = session.noise
+    if session.T_flange_camera is None or given is not None:
+        return
+    if n.hand_eye_rotation > _UNKNOWN_RAD or n.hand_eye_translation > _UNKNOWN_M:
+        known = f"known to {n.hand_eye_translation:g} m and {n.hand_eye_rotation:g} rad"
+        expected = "expected --calibration FILE (smooth and calibrate find the transform)"
+        raise InputError(f"{session.id}: the hand-eye transform is only {known}, {expected}")
 
 
 def _frames(session: Session, n_done: int, realtime: bool) -> Iterator[Frame]:
