@@ -15,6 +15,7 @@ from tracking.gating import mahalanobis_sq, matching_log_likelihood
 
 GATE_CHI2 = 16.3  # 3 degrees of freedom: 99.9 % of true matches
 LOG_2PI = float(np.log(2.0 * np.pi))
+_STILL = 1e-6  # squared step over its covariance, and relative change of weights, below which the solution stands
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,6 +126,8 @@ def solve(
         offsets = -(half[..., 6] - half[..., :6] @ step)
         d2 = np.einsum("ca,cab,cb->c", offsets, tie, offsets)
         used, tie = tie, _tie(data, b - (B @ step), shared, at_rest, scale)
+        if step @ H @ step < _STILL and np.abs(tie - used).max() < _STILL * np.abs(used).max():
+            break
     r = transform(T, points) - places - offsets[group]
     chi2 = mahalanobis_sq(r, V)
     log_dets = (V, 1.0), (A, 1.0), (used, -1.0)

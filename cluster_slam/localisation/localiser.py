@@ -60,6 +60,8 @@ class Localisation:
 
 Plant = Landmarks | PlantMap
 _MOST_TRIED = 8  # plants that are searched one after the other; of more, those that the index of triples names
+_WORSE_BY = 25.0  # log of the likelihood, roughly: a guess so far behind the best has no share in the probability
+_TURNED = 1.0 + 2.0 * float(np.cos(0.5))  # trace of a turn by half a radian: never the same pose
 _NEAR_SCORE = 1.5  # groups by which a plant that is looked at may be behind the first
 _MOST_THOROUGH = 2  # of many plants: those that are searched with all means where nothing is sure yet
 _MOST_READY = 64  # plants that are kept made ready
@@ -172,7 +174,7 @@ class Localiser:
         )
         density = null_density(marks, look)
         out: list[Hypothesis] = []
-        for T in poses:
+        for T in poses[scores > scores.max() - _WORSE_BY]:
             fit = refine(look, marks, T, scale, density)
             if fit is not None and not any(_same(fit, other.fit) for other in out):
                 out.append(Hypothesis(plant, fit, log_evidence(fit, look, marks, scale)))
@@ -213,5 +215,8 @@ def _same(a: Fit, b: Fit) -> bool:
     """Whether two fits are one: the same matches, or poses that lie within each other's errors."""
     if np.array_equal(a.rows, b.rows) and np.array_equal(a.flowers, b.flowers):
         return True
-    xi = se3_log(inverse(a.T_map_camera) @ b.T_map_camera)
+    moved = inverse(a.T_map_camera) @ b.T_map_camera
+    if np.trace(moved[:3, :3]) < _TURNED:
+        return False
+    xi = se3_log(moved)
     return bool(xi @ (a.information @ xi) < 25.0 or xi @ (b.information @ xi) < 25.0)

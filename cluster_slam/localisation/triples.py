@@ -51,9 +51,10 @@ def matching_triples(distances: Array, sides: Array, tolerance: Array, max_found
 
     ``distances`` (f, f) between all landmarks. At most ``max_found``, evenly taken from all.
     """
-    fits = [np.abs(distances - s) < t for s, t in zip(sides, tolerance, strict=True)]
-    i, j = np.nonzero(fits[0])
-    ac, bc = np.packbits(fits[1], axis=1), np.packbits(fits[2], axis=1)
+    low = np.maximum(sides - tolerance, 0.0).astype(distances.dtype)
+    high = (sides + tolerance).astype(distances.dtype)
+    i, j = np.nonzero((distances > low[0]) & (distances < high[0]))
+    ac, bc = (np.packbits((distances > low[k]) & (distances < high[k]), axis=1) for k in (1, 2))
     both = ac[i] & bc[j]
     some = np.flatnonzero(both.any(1))
     row, k = np.nonzero(np.unpackbits(both[some], axis=1, count=distances.shape[0]))
