@@ -49,6 +49,11 @@ class Explained:
         return len(self.query)
 
 
+def n_flowers(found: Explained) -> int:
+    """How many flowers an explanation has a partner for."""
+    return int((found.partner >= 0).sum())
+
+
 def explain(scene: Scene, poses: Similarities) -> list[Explained]:
     """Explanations by each pose of a stack."""
     moved = poses.apply(scene.query.centres)
@@ -115,7 +120,7 @@ def refine(scene: Scene, found: Explained, n_rounds: int = 4) -> Explained:
     """Fit and explain in turns, as long as the explanation gets likelier."""
     best = found
     for _ in range(n_rounds):
-        if len(best) < scene.query.centres.shape[1]:
+        if n_flowers(best) < scene.query.centres.shape[1]:
             break
         pose = fit(_robust(matched_pairs(scene, best), best.pose), scene.scale_range)
         again = explain(scene, pose)[0]

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from cluster_slam.constellation.match import Found
-from cluster_slam.constellation.units import MATCH_FLOOR_M, log_ball
+from cluster_slam.constellation.units import MATCH_FLOOR_M, spread_of
 from cluster_slam.geometry import Array
 from cluster_slam.records import Constellation, IntArray
 from tracking.assignment import assign
 from tracking.reid import association_probabilities
 
 ELSEWHERE = 0.01  # prior of a flower that was grouped with another cluster than the map has it in
+BESIDE = 0.1  # a cluster opens where another one stands so many times as often as anywhere: they would be one group
 TAIL = 3.0  # some flowers' errors are so many times as large ...
 TAIL_SHARE = 0.01  # ... this share of them, ...
 TAIL_SHARE_SINGLE = 0.05  # ... or this, where each flower stands for itself
@@ -155,10 +156,27 @@ def _strangers(session: Constellation, match: Found) -> tuple[Array, Array]:
     partner = np.full(len(session.cluster_ids), -1)
     partner[scene.query.cluster[found.query]] = scene.known.cluster[found.known]
     hidden = len(match.plant.flowers) / max(len(match.plant.cluster_ids), 1) * (1.0 - scene.config.seen_share)
-    beside = np.log(background.n_new + hidden) + background.log_density
+    beside = np.log(background.n_new + hidden) + _within_cluster(session, match)
     null = np.where(partner[row] >= 0, np.maximum(beside, alone), alone)
     same = partner[row][:, None] == match.plant.flower_rows
     return null, np.where(same, 0.0, np.log(ELSEWHERE))
+
+
+def _within_cluster(session: Constellation, match: Found) -> Array:
+    """Log density (f,) of a new flower at each one's place: as likely about the cluster's middle as anywhere in it."""
+    scene, found = match.scene, match.best
+    d = scene.query.centres.shape[1]
+    points = found.pose.apply(match.space.session(session.flowers))[0]
+    var = spread_of(scene.background, d)
+    log_density = np.full(len(points), scene.background.log_density)
+    for k in range(len(found)):
+        rows = scene.query.flower[found.query[k]]
+        rows = rows[rows >= 0]
+        middle = scene.known.centres[found.known[k]] + found.offset[k]
+        squared = ((points[rows] - middle) ** 2).sum(axis=1)
+        gaussian = -0.5 * squared / var - 0.5 * d * np.log(2 * np.pi * var)
+        log_density[rows] = np.logaddexp(gaussian, scene.background.log_density) - np.log(2.0)
+    return log_density
 
 
 def _clusters(
@@ -204,11 +222,11 @@ def _turned_over(match: Found) -> Array:
     d = query.centres.shape[1]
     moved = found.pose.apply(query.centres)[0]
     n, k = (np.maximum(u.groups.mask.sum(axis=1), 1) for u in (query, known))
-    inside = np.exp(-2.0 / d * (background.log_density + log_ball(d))) / (d + 2)
+    inside = spread_of(background, d)
     var = inside / n[:, None] + inside / k + known.var_offset
     squared = ((moved[:, None] - known.centres) ** 2).sum(-1)
     expected = background.n_new + k * (1.0 - scene.config.seen_share)
     unseen = np.where(known.groups.mask, np.log1p(-np.clip(known.seen, 1e-3, 0.999)), 0.0).sum(axis=1)
     log_density = -0.5 * squared / var - 0.5 * d * np.log(2 * np.pi * var)
     ratio: Array = log_density + n[:, None] * np.log(expected) - expected + unseen
-    return ratio - background.log_group_density - scene.bonus[:, None]
+    return ratio - background.log_group_density - np.log(BESIDE) - scene.bonus[:, None]

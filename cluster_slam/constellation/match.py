@@ -8,11 +8,12 @@ import numpy as np
 from scipy.special import betaln
 
 from cluster_slam.config import GrowthConfig, MatchConfig
-from cluster_slam.constellation.explain import Explained, Scene, explain, matched_pairs, refine
+from cluster_slam.constellation.explain import Explained, Scene, explain, matched_pairs, n_flowers, refine
 from cluster_slam.constellation.fit import Pairs, pose_covariance
 from cluster_slam.constellation.growth import DAY_S
 from cluster_slam.constellation.plane import Space, spaces
 from cluster_slam.constellation.poses import Places, best_distinct, guess_poses, quick_scores
+from cluster_slam.constellation.similarity import concatenate
 from cluster_slam.constellation.units import Units, background_of, log_volume, plant_units, session_units
 from cluster_slam.constellation.warp import field_log_density, warped
 from cluster_slam.geometry import Array
@@ -20,6 +21,7 @@ from cluster_slam.records import Constellation, PlantMap
 
 SINGLES_UP_TO = 80  # flowers on each side that are also matched one by one
 N_REFINED = 6
+N_TOGETHER = 3  # poses of single flowers that are looked at with clusters as units, too
 MAX_PRIOR = 3.0  # log odds that a cluster is known because the others are: at most so much
 GLANCE_SEEDS, GLANCE_POSES = 10, 300  # of a glance
 LOOKS = 4000  # clusters that are looked at closely, over all poses: large plants need fewer poses to tell
@@ -91,6 +93,9 @@ def match(
         explained, again = _search(scene)
         repeated |= again
         candidates += [_Candidate(space, scene, e, _evidence(scene, e, single=single), single) for e in explained]
+        by_clusters = _scene(session, alive, space, config, growth, single=False, similarity=similarity)
+        if single and by_clusters is not None:
+            candidates += _together(space, by_clusters, explained)
     if not candidates:
         return Match(plant.name, 0.0, -np.inf, -np.inf, False)
     best = max(candidates, key=lambda c: c.evidence)
@@ -189,13 +194,25 @@ def _search(scene: Scene) -> tuple[list[Explained], bool]:
     return sorted(refined, key=lambda e: -e.log_ratio), repeated
 
 
+def _together(space: Space, by_clusters: Scene, explained: list[Explained]) -> list[_Candidate]:
+    """The likeliest poses of flowers one by one, with clusters as units: few in common place flowers, not centroids."""
+    poses = [e.pose for e in explained[:N_TOGETHER] if n_flowers(e) >= 3]
+    found = [refine(by_clusters, e) for e in explain(by_clusters, concatenate(poses))] if poses else []
+    return [_Candidate(space, by_clusters, e, _evidence(by_clusters, e, single=False), False) for e in found]
+
+
+def _is_too_few(found: Explained, d: int, *, single: bool) -> bool:
+    """Whether what was matched leaves the pose open: three flowers fix it, of two clusters at least."""
+    return len(found) < (d if single or d == 2 else 2) or n_flowers(found) < d
+
+
 def _evidence(scene: Scene, found: Explained, *, single: bool) -> float:
     """Log likelihood ratio with the pose integrated out (Laplace): the peak times its volume over the prior's.
 
     The prior is uniform over all turns and over places where the session overlaps the plant.
     """
     d = scene.query.centres.shape[1]
-    if len(found) < d:
+    if _is_too_few(found, d, single=single):
         return -np.inf
     pairs = _in_three(matched_pairs(scene, found))
     with_scale = scene.scale_range[0] < scene.scale_range[1]
@@ -275,7 +292,7 @@ def _found(session: Constellation, alive: PlantMap, best: _Candidate) -> Found |
         scene, found = warped(scene, found)
     else:
         scene, found = _with_prior(scene, found)
-    if len(found) < best.space.d:
+    if _is_too_few(found, best.space.d, single=best.single):
         return None
     pose, scale = found.pose, float(found.pose.scale[0])
     row, member = np.nonzero(found.partner >= 0)

@@ -33,10 +33,10 @@ def guess_poses(
 ) -> Similarities:
     """Poses query -> known (h) from agreeing triples, or pairs where d = 2; at most ``max_poses``, evenly taken."""
     d = query.centres.shape[1]
-    D = np.linalg.norm(known.centres[:, None] - known.centres, axis=2)
+    sides = _sides(known)
     parts = []
     for corner in _corners(query.centres, n_seeds, d):
-        found = _agreeing(query, known, D, corner, scale_range)
+        found = _agreeing(query, sides, corner, scale_range)
         if len(found):
             a = np.broadcast_to(query.centres[corner], (len(found), d, d))
             parts.append(align(a, known.centres[found], scale_range))
@@ -87,35 +87,66 @@ def _evenly(corners: IntArray, worth: Array, n: int, n_seeds: int) -> IntArray:
     return corners[kept]
 
 
-def _agreeing(query: Places, known: Places, D: Array, corner: IntArray, scale_range: tuple[float, float]) -> IntArray:
-    """Ordered triples (pairs) of known rows (k, d) whose sides, of the distances D (m, m), agree with the corner's."""
-    pairs = _side(query, known, D, corner[0], corner[1], scale_range)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sides:
+    """Pairs of known landmarks by their distance."""
+
+    known: Places
+    first: IntArray  # (p,) rows of each pair, shortest first
+    second: IntArray  # (p,)
+    lengths: Array  # (p,)
+
+
+def _sides(known: Places) -> _Sides:
+    i, j = np.triu_indices(len(known.centres), 1)
+    lengths = np.linalg.norm(known.centres[i] - known.centres[j], axis=1)
+    order = np.argsort(lengths, kind="stable")
+    return _Sides(known, i[order].astype(np.int64), j[order].astype(np.int64), lengths[order])
+
+
+def _agreeing(query: Places, sides: _Sides, corner: IntArray, scale_range: tuple[float, float]) -> IntArray:
+    """Ordered triples (pairs) of known rows (k, d) whose sides agree with the corner's."""
+    i, j = _side(query, sides, corner[0], corner[1], scale_range)
     if len(corner) == 2:
-        return np.stack(np.nonzero(pairs), axis=1)
-    second = _side(query, known, D, corner[1], corner[2], scale_range)
-    third = _side(query, known, D, corner[0], corner[2], scale_range)
-    i, j = np.nonzero(pairs)
+        return np.stack([i, j], axis=1)
     i, j = i[:_HEADS], j[:_HEADS]
-    if len(known.centres) <= 64:
-        row, k = np.nonzero(second[j] & third[i])
-        return np.stack([i[row], j[row], k], axis=1)
-    j2, k2 = np.nonzero(second)
+    j2, k2 = _side(query, sides, corner[1], corner[2], scale_range)
     begin, end = np.searchsorted(j2, j), np.searchsorted(j2, j, side="right")
     row = np.repeat(np.arange(len(i)), end - begin)
     step = np.arange(len(row)) - np.repeat(np.cumsum(end - begin) - (end - begin), end - begin)
-    k = k2[begin[row] + step]
-    good = third[i[row], k]
-    agreeing: IntArray = np.stack([i[row], j[row], k], axis=1)[good]
+    i, j, k = i[row], j[row], k2[begin[row] + step]
+    lengths = np.linalg.norm(sides.known.centres[i] - sides.known.centres[k], axis=1)
+    good = (i != k) & _is_as_long(query, sides.known, lengths, i, k, corner[0], corner[2], scale_range)
+    agreeing: IntArray = np.stack([i, j, k], axis=1)[good]
     return agreeing
 
 
-def _side(query: Places, known: Places, D: Array, a: int, b: int, scale_range: tuple[float, float]) -> BoolArray:
-    """Which pairs of known landmarks (m, m) are as far apart as two of the session."""
+def _side(query: Places, sides: _Sides, a: int, b: int, scale_range: tuple[float, float]) -> tuple[IntArray, IntArray]:
+    """Ordered pairs of known landmarks, by their rows, that are as far apart as two of the session."""
     length = float(np.linalg.norm(query.centres[a] - query.centres[b]))
-    var = known.sigma[:, None] ** 2 + known.sigma**2 + query.sigma[a] ** 2 + query.sigma[b] ** 2
-    slack = TOLERANCE * np.sqrt(var)
-    agrees = (scale_range[0] * length - slack <= D) & (scale_range[1] * length + slack >= D)
-    np.fill_diagonal(agrees, False)
+    widest = TOLERANCE * float(np.sqrt(2.0 * sides.known.sigma.max() ** 2 + query.sigma[a] ** 2 + query.sigma[b] ** 2))
+    begin, end = np.searchsorted(sides.lengths, [scale_range[0] * length - widest, scale_range[1] * length + widest])
+    i, j = sides.first[begin:end], sides.second[begin:end]
+    good = _is_as_long(query, sides.known, sides.lengths[begin:end], i, j, a, b, scale_range)
+    rows, columns = np.concatenate([i[good], j[good]]), np.concatenate([j[good], i[good]])
+    order = np.lexsort((columns, rows))
+    return rows[order], columns[order]
+
+
+def _is_as_long(
+    query: Places,
+    known: Places,
+    lengths: Array,
+    i: IntArray,
+    j: IntArray,
+    a: int,
+    b: int,
+    scale_range: tuple[float, float],
+) -> BoolArray:
+    """Whether known pairs (p,) of these lengths are as long as a pair of the session, within their sigmas."""
+    length = float(np.linalg.norm(query.centres[a] - query.centres[b]))
+    slack = TOLERANCE * np.sqrt(known.sigma[i] ** 2 + known.sigma[j] ** 2 + query.sigma[a] ** 2 + query.sigma[b] ** 2)
+    agrees = (scale_range[0] * length - slack <= lengths) & (scale_range[1] * length + slack >= lengths)
     return np.asarray(agrees, dtype=bool)
 
 

@@ -88,6 +88,11 @@ def background_of(first: Units, second: Units, config: MatchConfig, n_new: float
     return Background(float(log_inside), float(group), n_new)
 
 
+def spread_of(background: Background, d: int) -> float:
+    """Variance along each axis of a flower in its cluster, from the density of an ellipsoid of that variance."""
+    return float(np.exp(-2.0 / d * (background.log_density + log_ball(d))) / (d + 2))
+
+
 def log_volume(points: Array) -> float:
     """Log volume of the uniform ellipsoid (ellipse) with the second moments of points (n, d)."""
     d = points.shape[1]

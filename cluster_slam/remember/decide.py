@@ -16,7 +16,8 @@ from cluster_slam.records import Constellation, PlantMap
 
 FAMILIAR = 2.0  # log odds of a plant that the map has, before looking: most sessions show one
 REPEATED = 0.5  # a rival that explains more than this share of the best evidence is a clone, or a repeated structure
-N_CLOSE = 6  # plants that are matched in full where the map has many
+N_CLOSE = 6  # plants that are matched in full where the map has many ...
+COMES_NEAR = 0.3  # ... the best two at a glance, and those that reach this share of the best one's score
 
 
 class Refusal(StrEnum):
@@ -84,7 +85,8 @@ def _worth_a_look(
     for k, plant in enumerate(plants):
         say(f"glancing at {plant.name}", 0.5 * k / len(plants))
         scores.append(glance(session, plant, config.match, similarity=similarity))
-    return set(np.argsort(-np.array(scores), kind="stable")[:N_CLOSE].tolist())
+    order = np.argsort(-np.array(scores), kind="stable")[:N_CLOSE].tolist()
+    return {k for n, k in enumerate(order) if n < 2 or scores[k] > COMES_NEAR * scores[order[0]]}
 
 
 def _probabilities(matches: list[Match]) -> Array:

@@ -79,7 +79,7 @@ def flower_rows(plant: PlantMap) -> list[Row]:
 
 def _numbers(rows: Sequence[Row], width: int) -> Array:
     """Rows as numbers (n, width), NULL as NaN."""
-    return np.array([[np.nan if v is None else v for v in row] for row in rows], dtype=float).reshape(-1, width)
+    return np.array(rows, dtype=float).reshape(-1, width)  # None becomes NaN
 
 
 def _plain(row: list[float]) -> list[float | None]:

@@ -178,7 +178,8 @@ def undo(store: MapStore) -> StoredSession:
         found = connection.execute("SELECT before FROM journal WHERE session_id = ?", (last.id,)).fetchone()
         if found is None:
             raise InputError(
-                f"{store.path}: session {last.session!r} cannot be undone: it is too long ago, or came by a merge"
+                f"{store.path}: session {last.session!r} cannot be undone: "
+                "it is too long ago, came by a merge, or was optimised since"
             )
         journal = json.loads(zlib.decompress(found[0]))
         _check_events(connection, store, last, [row[0] for row in journal["clusters"] if len(row) == 1])
