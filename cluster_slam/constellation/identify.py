@@ -228,5 +228,6 @@ def _turned_over(match: Found) -> Array:
     expected = background.n_new + k * (1.0 - scene.config.seen_share)
     unseen = np.where(known.groups.mask, np.log1p(-np.clip(known.seen, 1e-3, 0.999)), 0.0).sum(axis=1)
     log_density = -0.5 * squared / var - 0.5 * d * np.log(2 * np.pi * var)
-    ratio: Array = log_density + n[:, None] * np.log(expected) - expected + unseen
-    return ratio - background.log_group_density - np.log(BESIDE) - scene.bonus[:, None]
+    ratio: Array = log_density + n[:, None] * np.log(expected) - expected + unseen - scene.bonus[:, None]
+    ratio -= background.log_group_density + np.log(BESIDE)
+    return ratio

@@ -7,6 +7,7 @@ so a pose that is there is found. Then a quick score, and the best poses that di
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -50,6 +51,12 @@ def guess_poses(
 
 def _corners(centres: Array, n_seeds: int, d: int) -> IntArray:
     """Well-shaped triples (pairs) of rows (s, d): large area over longest side, each row used evenly."""
+    return _corners_of(np.ascontiguousarray(centres).tobytes(), n_seeds, d)
+
+
+@lru_cache(maxsize=8)  # a session is compared with many plants
+def _corners_of(content: bytes, n_seeds: int, d: int) -> IntArray:
+    centres = np.frombuffer(content).reshape(-1, d)
     n = len(centres)
     chosen = np.unique(np.linspace(0, n - 1, min(n, _BEGINNINGS)).round().astype(np.int64))
     D = np.linalg.norm(centres[:, None] - centres, axis=2)
@@ -99,8 +106,9 @@ class _Sides:
 
 def _sides(known: Places) -> _Sides:
     i, j = np.triu_indices(len(known.centres), 1)
-    lengths = np.linalg.norm(known.centres[i] - known.centres[j], axis=1)
-    order = np.argsort(lengths, kind="stable")
+    apart = known.centres[i] - known.centres[j]
+    lengths = np.sqrt(np.einsum("pd,pd->p", apart, apart))
+    order = np.argsort(lengths)
     return _Sides(known, i[order].astype(np.int64), j[order].astype(np.int64), lengths[order])
 
 
