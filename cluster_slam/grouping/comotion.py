@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
+from scipy.special import ndtr
 
 from cluster_slam.geometry import Array
 from cluster_slam.records import BoolArray
@@ -62,12 +63,18 @@ def motion_evidence(places: Array, motion: Motion, reach: float) -> csr_matrix:
 def log_likelihood_ratio(ratio: Array, sigma: Array, turning: float) -> Array:
     """Of ratios with standard deviations ``sigma``; ``turning`` is the usual ratio within a cluster that turns."""
     together = _normal(ratio, 0.5 * turning, np.hypot(sigma, 0.02 + turning))
-    apart = _normal(ratio, _APART[0], np.hypot(sigma, _APART[1]))
+    apart = 0.5 * _normal(ratio, _APART[0], np.hypot(sigma, _APART[1])) + 0.5 * _uniform(ratio, sigma)
     anything = np.where(np.abs(ratio) < _RANGE, 1.0, 0.0) / (2.0 * _RANGE) + _normal(ratio, 0.5, 0.5 * _RANGE + sigma)
     anything = 0.5 * anything
     value: Array = np.log(
         ((1.0 - _ANYTHING) * together + _ANYTHING * anything) / ((1.0 - _ANYTHING) * apart + _ANYTHING * anything)
     )
+    return value
+
+
+def _uniform(x: Array, sigma: Array) -> Array:
+    """Density of what lies anywhere between 0 and ``_RANGE``, seen with errors sigma."""
+    value: Array = (ndtr(x / sigma) - ndtr((x - _RANGE) / sigma)) / _RANGE
     return value
 
 

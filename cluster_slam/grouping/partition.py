@@ -3,6 +3,10 @@
 Clusters stand anywhere in the space that was looked at; members scatter about their centroid with one sigma for all
 clusters; the number of members is Poisson, and some flowers are loose. To this comes the evidence of each pair within a
 cluster; of the pairs among n members at most n - 1 say something new, so that they weigh no more than that together.
+
+Neither clusters nor members come in an order: the density of c clusters in a volume V is c! / V^c, and that of n members
+n! times their number's probability (a Neyman-Scott process; Daley and Vere-Jones, "An introduction to the theory of
+point processes", 2003, section 6.3). It matters where clusters are many.
 """
 
 from __future__ import annotations
@@ -56,7 +60,7 @@ class Likelihood:
         dof = 3.0 * (n - c)
         var = (square + 3.0 * prior_weight * self.prior_sigma**2) / (dof + 3.0 * prior_weight)
         scatter = -0.5 * dof * np.log(2.0 * np.pi * var) - 0.5 * square / var - 1.5 * np.log(size).sum()
-        return float(scatter - c * self.log_volume + _log_sizes(size))
+        return float(scatter + gammaln(c + 1.0) - c * self.log_volume + _log_sizes(size))
 
     def _motion(self, label: IntArray, size: IntArray) -> float:
         within = label[self.row] == label[self.col]
@@ -67,13 +71,13 @@ class Likelihood:
 
 
 def _log_sizes(size: IntArray) -> float:
-    """Log-probability of the clusters' sizes: Poisson from one upwards, but for a share of loose flowers.
+    """Log-density of members in no order: as many as a Poisson number from one upwards, but for a share of loose ones.
 
     That share is as the partition itself has it, with a weak prior of one in four.
     """
     c = len(size)
     mean = max(size.mean(), 1.0 + 1e-6)
-    poisson = size * np.log(mean) - mean - gammaln(size + 1.0) - np.log1p(-np.exp(-mean))
+    poisson = size * np.log(mean) - mean - np.log1p(-np.exp(-mean))
     loose = float((np.count_nonzero(size == 1) + 1.0) / (c + 4.0))
     return float((np.log1p(-loose) + np.logaddexp(poisson, np.where(size == 1, np.log(loose), -np.inf))).sum())
 
