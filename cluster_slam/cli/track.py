@@ -40,7 +40,7 @@ def command(
         Path, typer.Option("--out", "-o", metavar="OUT", help="Result folder; an earlier result in it is replaced.")
     ],
     session: Annotated[
-        Path | None, typer.Argument(metavar="[SESSION]", help="Session folder.", show_default=False)
+        Path | None, typer.Argument(metavar="SESSION", help="Session folder.", show_default=False)
     ] = None,
     robot: Annotated[
         str | None, typer.Option("--robot", metavar="HOST", help="Follow this arm, live.", show_default=False)
