@@ -128,6 +128,23 @@ def test_millimetres_are_refused(tmp_path: Path) -> None:
         add(store, replace(incoming, constellation=large))
 
 
+def test_another_unit_or_frame_is_refused(tmp_path: Path) -> None:
+    """Centimetres, and a left-handed frame, of the very plant: the map says no and stays as it was."""
+    plant = grown()
+    with map_of(tmp_path, plant) as store:
+        before = dump(store)
+        plant.grow_to(1.0)
+        incoming = rest_incoming(plant)
+        flowers = incoming.constellation.flowers
+        for wrong in (100.0 * flowers, flowers * [1.0, 1.0, -1.0]):
+            other = replace(incoming, constellation=replace(incoming.constellation, flowers=wrong))
+            refused = add(store, other, plant="row3")
+            assert refused.session is None
+            assert "no match" in refused.decision.reason
+            assert dump(store) == before
+        assert add(store, incoming, plant="row3").session is not None
+
+
 def test_a_named_plant_must_align(tmp_path: Path) -> None:
     with map_of(tmp_path, grown()) as store:
         before = dump(store)
