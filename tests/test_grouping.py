@@ -66,9 +66,11 @@ def test_a_poorly_known_ratio_says_little() -> None:
 
 
 def test_evidence_by_hand() -> None:
-    # ratio 0, sigma 0, no turning: N(0; 0, 0.02) = 19.947 against N(0; 0.95, 0.35) = 0.02864, and 5 % of anything:
+    # ratio 0, sigma 0, no turning: N(0; 0, 0.02) = 19.947 against N(0; 0.95, 0.35) = 0.02864 by half and by half
+    # anywhere from 0 to 1.4, the edge of which has 0.5 / 1.4 = 0.35714; and 5 % of anything:
     # (1 / 2.8 + N(0; 0.5, 0.7)) / 2 = (0.35714 + 0.44159) / 2 = 0.39937
-    expected = np.log((0.95 * 19.947 + 0.05 * 0.39937) / (0.95 * 0.02864 + 0.05 * 0.39937))
+    apart = 0.5 * 0.02864 + 0.5 * 0.35714
+    expected = np.log((0.95 * 19.947 + 0.05 * 0.39937) / (0.95 * apart + 0.05 * 0.39937))
     assert log_likelihood_ratio(np.array([0.0]), np.array([0.0]), 0.0)[0] == pytest.approx(expected, rel=1e-3)
 
 

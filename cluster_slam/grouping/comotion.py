@@ -29,9 +29,10 @@ _FEWEST_FRAMES = 5
 _SYSTEMATIC = 0.02  # of an observation's variance: how well places at rest are known, which does not average out
 _SURE = 0.33  # motion of three times its own standard deviation is there at all
 _WRONG = 0.03  # of the frames of a pair: those with the largest differences are left out
-_APART = (0.95, 0.35)  # ratio of flowers of two clusters, mean and sigma ...
-_ANYTHING = 0.05  # ... and this share of all pairs has any ratio
+_APART = (0.95, 0.35)  # ratio of flowers of two clusters, mean and sigma; half of them lie anywhere below _RANGE
+_ANYTHING = 0.05  # this share of all pairs has any ratio
 _RANGE = 1.4
+_TINY = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,6 +75,7 @@ def log_likelihood_ratio(ratio: Array, sigma: Array, turning: float) -> Array:
 
 def _uniform(x: Array, sigma: Array) -> Array:
     """Density of what lies anywhere between 0 and ``_RANGE``, seen with errors sigma."""
+    sigma = np.maximum(sigma, _TINY)
     value: Array = (ndtr(x / sigma) - ndtr((x - _RANGE) / sigma)) / _RANGE
     return value
 

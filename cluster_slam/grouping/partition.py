@@ -4,9 +4,9 @@ Clusters stand anywhere in the space that was looked at; members scatter about t
 clusters; the number of members is Poisson, and some flowers are loose. To this comes the evidence of each pair within a
 cluster; of the pairs among n members at most n - 1 say something new, so that they weigh no more than that together.
 
-Neither clusters nor members come in an order: the density of c clusters in a volume V is c! / V^c, and that of n members
-n! times their number's probability (a Neyman-Scott process; Daley and Vere-Jones, "An introduction to the theory of
-point processes", 2003, section 6.3). It matters where clusters are many.
+Neither clusters nor members come in an order: the density of c clusters in a volume V is c! / V^c, and that of n
+members n! times their number's probability (a Neyman-Scott process; Daley and Vere-Jones, "An introduction to the
+theory of point processes", 2003, section 6.3). It matters where clusters are many.
 """
 
 from __future__ import annotations

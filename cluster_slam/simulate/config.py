@@ -173,7 +173,7 @@ _STRANGE: dict[str, dict[str, Any]] = {
     "translation": {"turn_rad": 0.0},
     "long": {"duration_s": 5000 / 30},
     "longest": {"duration_s": 20000 / 30},
-    "huge": {"n_clusters": 300, "cluster_spacing_m": 0.08, "plant_width_m": 3.5},
+    "huge": {"n_clusters": 300, "plant_width_m": 8.0},
 }
 
 
