@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from cluster_slam.association.drift_labels import Labelling, choice_cost
 from cluster_slam.association.drift_smoother import DriftSmoother, steps_of
-from cluster_slam.association.drifting import _choice_cost, _State, _Tracer, needs_tracing, trace_drifting
+from cluster_slam.association.drifting import needs_tracing, trace_drifting
 from cluster_slam.association.frames import Frames, sort_by_frame
 from cluster_slam.config import ParticleConfig
 from cluster_slam.evaluation.trajectory import absolute_error
@@ -103,10 +104,10 @@ def test_poses_that_hardly_drift_are_kept(world: _World) -> None:
 
 
 def test_choice_between_landmarks_costs_what_it_tells() -> None:
-    assert _choice_cost(np.zeros(50, dtype=np.int64)) == 0.0
-    assert _choice_cost(np.array([0, 1] * 20 + [-1] * 7)) == pytest.approx(2.0 * 40 * np.log(2.0))
+    assert choice_cost(np.zeros(50, dtype=np.int64)) == 0.0
+    assert choice_cost(np.array([0, 1] * 20 + [-1] * 7)) == pytest.approx(2.0 * 40 * np.log(2.0))
     three_to_one = 2.0 * (3 * np.log(4.0 / 3.0) + np.log(4.0))
-    assert _choice_cost(np.array([2, 2, 2, 5])) == pytest.approx(three_to_one)
+    assert choice_cost(np.array([2, 2, 2, 5])) == pytest.approx(three_to_one)
 
 
 def test_one_landmark_split_in_two_is_put_together(world: _World) -> None:
@@ -117,10 +118,10 @@ def test_one_landmark_split_in_two_is_put_together(world: _World) -> None:
     T, places = smoother.solve(world.given, _PLACES, world.label, 30)
     error = transform(T[world.frames.frame], world.frames.points) - places[world.label]
     label = np.where((world.label == 0) & (error[:, 0] > 0), len(places), world.label)
-    tracer = _Tracer(world.frames, world.given, steps, config, np.random.default_rng(0))
+    labels = Labelling(world.frames, steps, config)
     price = config.landmark_cost
-    split = tracer.settle(T, label, np.concatenate([places, places[:1]]), price)
-    merged = tracer.merge(_State(split.T, split.label, split.places, split.cost), price)
+    split = labels.settle(T, label, np.concatenate([places, places[:1]]), price)
+    merged = labels.merge(split, price)
     assert len(split.places) == len(_PLACES) + 1
     assert len(merged.places) == len(_PLACES)
     assert merged.cost < split.cost

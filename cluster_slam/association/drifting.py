@@ -13,9 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from cluster_slam.association.calibration import Calibration, calibrate, delayed
+from cluster_slam.association.drift_labels import Labelling, State, choice_cost
 from cluster_slam.association.drift_smoother import DriftSmoother, Steps, steps_of
 from cluster_slam.association.frames import Frames
 from cluster_slam.association.particles import trace_stretch
@@ -85,20 +85,10 @@ def trace_drifting(
     return Traced(best.T, best.label, best.places, scaled, best.cost, calibration)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _State:
-    """Poses, labels and places of the frames so far, and what they cost."""
-
-    T: Array
-    label: IntArray
-    places: Array
-    cost: float
-
-
-def _anchored(state: _State, first: Array) -> _State:
+def _anchored(state: State, first: Array) -> State:
     """The same with the first pose (4, 4) where it defines the world."""
     home = first @ inverse(state.T[0])
-    return _State(home @ state.T, state.label, transform(home, state.places), state.cost)
+    return State(home @ state.T, state.label, transform(home, state.places), state.cost)
 
 
 class _Tracer:
@@ -108,8 +98,9 @@ class _Tracer:
         self, frames: Frames, given: Array, steps: Steps, config: ParticleConfig, rng: np.random.Generator
     ) -> None:
         self.frames, self.given, self.steps, self.config, self.rng = frames, given, steps, config, rng
+        self.labels = Labelling(frames, steps, config)
 
-    def assemble(self) -> _State:
+    def assemble(self) -> State:
         """Map what lies between gaps for itself, then join the parts: the largest, then what joins most clearly."""
         spans = spans_between_gaps(self.steps, self.frames.n_frames, self.config.gap_steps)
         parts = [self._part(*span) for span in spans]
@@ -123,7 +114,7 @@ class _Tracer:
             clearest = int(np.argmax([share for _, share in ranked]))
             whole = ranked[clearest][0]
             low, high = min(low, sides[clearest]), max(high, sides[clearest])
-        return _State(whole.T, whole.label, whole.places, 0.0)
+        return State(whole.T, whole.label, whole.places, 0.0)
 
     def _window(self, first: int, end: int) -> _Tracer:
         """The same for a part of the session."""
@@ -135,10 +126,10 @@ class _Tracer:
         tracer = self._window(first, end)
         n = len(tracer.frames)
         if n < self.config.fewest_points:
-            return tracer.as_part(_State(self.given[first:end], np.full(n, -1), np.empty((0, 3)), 0.0), first)
+            return tracer.as_part(State(self.given[first:end], np.full(n, -1), np.empty((0, 3)), 0.0), first)
         return tracer.as_part(tracer.grow(), first)
 
-    def as_part(self, state: _State, first: int) -> Part:
+    def as_part(self, state: State, first: int) -> Part:
         """A state as a part of a session, whose first frame it is."""
         var = self._covs(state)[:, 0, 0] * self.config.submap_slack**2
         return Part(first, first + len(state.T), state.T, state.label, state.places, var, self.frames.frame)
@@ -152,18 +143,18 @@ class _Tracer:
         tries = []
         for z in motions(a, b, self.steps, self.config.n_motions):
             trial = matched(joined(a, b, z, self.steps), len(a.places))
-            tries.append(tracer.settle(trial.T, trial.label, trial.places, price, 1))
+            tries.append(tracer.labels.settle(trial.T, trial.label, trial.places, price, 1))
         tries.sort(key=lambda state: state.cost)
-        best = tracer.merge(tries[0], price)
+        best = tracer.labels.merge(tries[0], price)
         own = np.isin(tracer.frames.order, self._window(b.first, b.end).frames.order)
         known = np.unique(best.label[np.logical_not(own)])
         share = float(np.isin(best.label[own], known[known >= 0]).mean())
         return tracer.as_part(best, min(a.first, b.first)), share
 
-    def grow(self) -> _State:
+    def grow(self) -> State:
         """Go through the session, stretch by stretch."""
         n, starts, config = self.frames.n_frames, self.frames.starts, self.config
-        state = _State(np.empty((0, 4, 4)), np.empty(0, dtype=np.int64), np.empty((0, 3)), 0.0)
+        state = State(np.empty((0, 4, 4)), np.empty(0, dtype=np.int64), np.empty((0, 3)), 0.0)
         done = 0
         while done < n:
             end = min(max(done + 1, int(np.searchsorted(starts, starts[done] + config.stretch_points))), n)
@@ -180,7 +171,7 @@ class _Tracer:
             done = end
         return state
 
-    def _extend(self, state: _State, done: int, end: int, ahead: int, after_gap: bool) -> _State:
+    def _extend(self, state: State, done: int, end: int, ahead: int, after_gap: bool) -> State:
         """Associate the frames from ``done`` to ``end`` and smooth all so far."""
         found = trace_stretch(
             self.frames,
@@ -197,21 +188,21 @@ class _Tracer:
         T = np.concatenate([state.T, found.T[: end - done]])
         label = np.concatenate([state.label, found.label[:n_points]])
         price = self.config.growing_cost
-        return self.merge(self.settle(T, label, found.places, price), price)
+        return self.labels.merge(self.labels.settle(T, label, found.places, price), price)
 
-    def price(self, state: _State) -> _State:
+    def price(self, state: State) -> State:
         """The same with the final price of landmarks, which merges more of them."""
         price = self.config.landmark_cost
-        return self.merge(self.settle(state.T, state.label, state.places, price), price, 40)
+        return self.labels.merge(self.labels.settle(state.T, state.label, state.places, price), price, 40)
 
-    def redo(self, state: _State) -> _State:
+    def redo(self, state: State) -> State:
         """Associate every stretch again, with the landmarks that the others support, as long as that helps."""
         price = self.config.landmark_cost
         for _ in range(self.config.n_redo):
             new = state
             for span in self._spans():
                 new = self._redo_span(new, span, price)
-            new = self.merge(self.settle(new.T, new.label, new.places, price), price)
+            new = self.labels.merge(self.labels.settle(new.T, new.label, new.places, price), price)
             if new.cost >= state.cost - 1.0:
                 break
             state = new
@@ -224,7 +215,7 @@ class _Tracer:
         bounds = sorted({0, *bounds})
         return list(zip(bounds[:-2], bounds[2:], strict=True)) or [(0, self.frames.n_frames)]
 
-    def _redo_span(self, state: _State, span: tuple[int, int], price: float) -> _State:
+    def _redo_span(self, state: State, span: tuple[int, int], price: float) -> State:
         """Associate the frames of a span again, if that is likelier there, the rest of the session standing still."""
         a, b = span
         first, end = max(0, a - (b - a) // 2), min(self.frames.n_frames, b + (b - a) // 2)
@@ -232,7 +223,7 @@ class _Tracer:
         inside = slice(int(self.frames.starts[a]) - around.start, int(self.frames.starts[b]) - around.start)
         elsewhere = state.label.copy()
         elsewhere[around] = -1
-        covs = self._covs(_State(state.T, elsewhere, state.places, 0.0))
+        covs = self._covs(State(state.T, elsewhere, state.places, 0.0))
         part = self._window(first, end)
         smoother = DriftSmoother(part.frames, part.steps, self.config.point_dof, state.places, 1.0 / covs[:, 0, 0])
         old = part.local(smoother, state.T[first:end], state.label[around], state.places)
@@ -256,113 +247,25 @@ class _Tracer:
         T[first:end], label[around] = new.T, new.label
         before = state.label.copy()
         before[around] = old.label
-        if new.cost + price * n_new + _choice_cost(label) >= old.cost + _choice_cost(before) - 1e-6:
+        if new.cost + price * n_new + choice_cost(label) >= old.cost + choice_cost(before) - 1e-6:
             return state
-        return _State(T, label, np.concatenate([state.places, new.places[len(state.places) :]]), np.inf)
+        return State(T, label, np.concatenate([state.places, new.places[len(state.places) :]]), np.inf)
 
     def local(
         self, smoother: DriftSmoother, T: Array, label: IntArray, places: Array, again: slice | None = None
-    ) -> _State:
+    ) -> State:
         """Smoothed with places that others hold; the points ``again`` are associated once more."""
         T, places = smoother.solve(T, places, label)
         if again is not None:
             label = label.copy()
-            label[again] = self._associate(smoother, T, places)[again]
+            label[again] = self.labels.associate(smoother, T, places)[again]
             T, places = smoother.solve(T, places, label)
         clutter = self.config.clutter_cost * int((label < 0).sum())
-        return _State(T, label, places, smoother.cost(T, places, label) + clutter)
+        return State(T, label, places, smoother.cost(T, places, label) + clutter)
 
-    def _covs(self, state: _State) -> Array:
+    def _covs(self, state: State) -> Array:
         """How well places are known (l, 3, 3) relative to the latest pose: noise that repeats, and that does not."""
         noise_sq = float(np.median(np.trace(self.frames.covs, axis1=1, axis2=2)))
         count = np.bincount(state.label[state.label >= 0], minlength=len(state.places))
         var = noise_sq * (0.06 + 2.5 / np.maximum(count, 1))
         return np.asarray(var[:, None, None] * np.eye(3))
-
-    def settle(self, T: Array, label: IntArray, places: Array, price: float, n_rounds: int = 3) -> _State:
-        """Smooth, associate again, until nothing changes."""
-        smoother = self._smoother(len(T))
-        places, label = _compact(places, label)
-        for _ in range(n_rounds):
-            T, places = smoother.solve(T, places, label)
-            again = self._associate(smoother, T, places)
-            same = float((again == label).mean())
-            places, label = _compact(places, again)
-            if same > 0.998:
-                break
-        T, places = smoother.solve(T, places, label)
-        clutter = self.config.clutter_cost * int((label < 0).sum())
-        cost = smoother.cost(T, places, label) + clutter + price * len(places) + _choice_cost(label)
-        return _State(T, label, places, cost)
-
-    def _smoother(self, n: int) -> DriftSmoother:
-        f = self.frames
-        k = int(f.starts[n])
-        part = Frames(f.order[:k], f.starts[: n + 1], f.frame[:k], f.points[:k], f.covs[:k], f.stamps[:n])
-        return DriftSmoother(part, self.steps.between(0, n), self.config.point_dof)
-
-    def _associate(self, smoother: DriftSmoother, T: Array, places: Array) -> IntArray:
-        """Landmark of each point (m,), one to one in every frame; -1 where none fits."""
-        limit, frames = self.config.clutter_cost, smoother.frames
-        if len(places) == 0:
-            return np.full(len(frames), -1)
-        cost = smoother.point_cost(smoother.distances(T, places))
-        label = cost.argmin(axis=1)
-        label[cost.min(axis=1) > limit] = -1
-        for i in np.flatnonzero(np.diff(frames.starts) > 1):
-            here = frames.of(int(i))
-            q = here.stop - here.start
-            _, column = linear_sum_assignment(np.concatenate([cost[here], np.full((q, q), limit)], axis=1))
-            label[here] = np.where(column < len(places), column, -1)
-        return np.asarray(label)
-
-    def merge(self, state: _State, price: float, n_tries: int = 12) -> _State:
-        """Try close landmarks that are hardly ever seen together as one; keep what makes the whole likelier."""
-        failed: set[tuple[float, ...]] = set()
-        while n_tries > 0:
-            merged = None
-            for a, b in self._merge_candidates(state):
-                key = tuple(np.round(np.concatenate([state.places[a], state.places[b]]), 1).tolist())
-                if key in failed or n_tries <= 0:
-                    continue
-                n_tries -= 1
-                label = np.where(state.label == a, b, state.label)
-                trial = self.settle(state.T, label, state.places, price, 2)
-                if trial.cost < state.cost:
-                    merged = trial
-                    break
-                failed.add(key)
-            if merged is None:
-                break
-            state = merged
-        return state
-
-    def _merge_candidates(self, state: _State) -> list[tuple[int, int]]:
-        """Pairs of landmarks (fewer points first), the closest first."""
-        n = len(state.places)
-        seen = np.zeros((n, len(state.T)))
-        used = state.label >= 0
-        seen[state.label[used], self.frames.frame[: len(state.label)][used]] = 1.0
-        both, count = seen @ seen.T, seen.sum(axis=1)
-        distance = np.linalg.norm(state.places[:, None] - state.places[None], axis=-1)
-        allowed = both <= np.maximum(1.0, 0.03 * np.minimum(count[:, None], count))
-        allowed &= (distance < self.config.merge_reach_m) & np.tri(n, k=-1, dtype=bool)
-        pairs = sorted((float(distance[a, b]), int(a), int(b)) for a, b in np.argwhere(allowed))
-        return [(a, b) if count[a] <= count[b] else (b, a) for _, a, b in pairs]
-
-
-def _choice_cost(label: IntArray) -> float:
-    """Twice the negative log-probability of the labels (m,), given how often each landmark is seen.
-
-    Without it two landmarks always fit the points of one better than one does: each point takes the nearer.
-    """
-    count = np.bincount(label[label >= 0])
-    count = count[count > 0]
-    return float(-2.0 * (count * np.log(count / max(count.sum(), 1))).sum())
-
-
-def _compact(places: Array, label: IntArray) -> tuple[Array, IntArray]:
-    """Places (l, 3) and labels (m,) without the landmarks that fewer than two points support."""
-    keep = np.bincount(label[label >= 0], minlength=len(places)) >= 2
-    number = np.where(keep, np.cumsum(keep) - 1, -1)
-    return places[keep], np.where(label >= 0, number[label], -1) if len(places) else label

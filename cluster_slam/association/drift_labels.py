@@ -1,0 +1,119 @@
+"""Which landmark each point of a drifting session is, where poses are nearly right: smooth, associate, merge, again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from cluster_slam.association.drift_smoother import DriftSmoother, Steps
+from cluster_slam.association.frames import Frames
+from cluster_slam.config import ParticleConfig
+from cluster_slam.geometry import Array
+from cluster_slam.records import IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Poses, labels and places of the frames so far, and what they cost."""
+
+    T: Array
+    label: IntArray
+    places: Array
+    cost: float
+
+
+class Labelling:
+    """Labels of the points of one session, given poses to begin with."""
+
+    def __init__(self, frames: Frames, steps: Steps, config: ParticleConfig) -> None:
+        self.frames, self.steps, self.config = frames, steps, config
+
+    def settle(self, T: Array, label: IntArray, places: Array, price: float, n_rounds: int = 3) -> State:
+        """Smooth, associate again, until nothing changes."""
+        smoother = self._smoother(len(T))
+        places, label = _compact(places, label)
+        for _ in range(n_rounds):
+            T, places = smoother.solve(T, places, label)
+            again = self.associate(smoother, T, places)
+            same = float((again == label).mean())
+            places, label = _compact(places, again)
+            if same > 0.998:
+                break
+        T, places = smoother.solve(T, places, label)
+        clutter = self.config.clutter_cost * int((label < 0).sum())
+        cost = smoother.cost(T, places, label) + clutter + price * len(places) + choice_cost(label)
+        return State(T, label, places, cost)
+
+    def _smoother(self, n: int) -> DriftSmoother:
+        f = self.frames
+        k = int(f.starts[n])
+        part = Frames(f.order[:k], f.starts[: n + 1], f.frame[:k], f.points[:k], f.covs[:k], f.stamps[:n])
+        return DriftSmoother(part, self.steps.between(0, n), self.config.point_dof)
+
+    def associate(self, smoother: DriftSmoother, T: Array, places: Array) -> IntArray:
+        """Landmark of each point (m,), one to one in every frame; -1 where none fits."""
+        limit, frames = self.config.clutter_cost, smoother.frames
+        if len(places) == 0:
+            return np.full(len(frames), -1)
+        cost = smoother.point_cost(smoother.distances(T, places))
+        label = cost.argmin(axis=1)
+        label[cost.min(axis=1) > limit] = -1
+        for i in np.flatnonzero(np.diff(frames.starts) > 1):
+            here = frames.of(int(i))
+            q = here.stop - here.start
+            _, column = linear_sum_assignment(np.concatenate([cost[here], np.full((q, q), limit)], axis=1))
+            label[here] = np.where(column < len(places), column, -1)
+        return np.asarray(label)
+
+    def merge(self, state: State, price: float, n_tries: int = 12) -> State:
+        """Try close landmarks that are hardly ever seen together as one; keep what makes the whole likelier."""
+        failed: set[tuple[float, ...]] = set()
+        while n_tries > 0:
+            merged = None
+            for a, b in self._merge_candidates(state):
+                key = tuple(np.round(np.concatenate([state.places[a], state.places[b]]), 1).tolist())
+                if key in failed or n_tries <= 0:
+                    continue
+                n_tries -= 1
+                label = np.where(state.label == a, b, state.label)
+                trial = self.settle(state.T, label, state.places, price, 2)
+                if trial.cost < state.cost:
+                    merged = trial
+                    break
+                failed.add(key)
+            if merged is None:
+                break
+            state = merged
+        return state
+
+    def _merge_candidates(self, state: State) -> list[tuple[int, int]]:
+        """Pairs of landmarks (fewer points first), the closest first."""
+        n = len(state.places)
+        seen = np.zeros((n, len(state.T)))
+        used = state.label >= 0
+        seen[state.label[used], self.frames.frame[: len(state.label)][used]] = 1.0
+        both, count = seen @ seen.T, seen.sum(axis=1)
+        distance = np.linalg.norm(state.places[:, None] - state.places[None], axis=-1)
+        allowed = both <= np.maximum(1.0, 0.03 * np.minimum(count[:, None], count))
+        allowed &= (distance < self.config.merge_reach_m) & np.tri(n, k=-1, dtype=bool)
+        pairs = sorted((float(distance[a, b]), int(a), int(b)) for a, b in np.argwhere(allowed))
+        return [(a, b) if count[a] <= count[b] else (b, a) for _, a, b in pairs]
+
+
+def choice_cost(label: IntArray) -> float:
+    """Twice the negative log-probability of the labels (m,), given how often each landmark is seen.
+
+    Without it two landmarks always fit the points of one better than one does: each point takes the nearer.
+    """
+    count = np.bincount(label[label >= 0])
+    count = count[count > 0]
+    return float(-2.0 * (count * np.log(count / max(count.sum(), 1))).sum())
+
+
+def _compact(places: Array, label: IntArray) -> tuple[Array, IntArray]:
+    """Places (l, 3) and labels (m,) without the landmarks that fewer than two points support."""
+    keep = np.bincount(label[label >= 0], minlength=len(places)) >= 2
+    number = np.where(keep, np.cumsum(keep) - 1, -1)
+    return places[keep], np.where(label >= 0, number[label], -1) if len(places) else label
