@@ -244,10 +244,13 @@ class BatchSmoother:
         self._stretch_mean = b if self._stretch_mean is None else self._stretch_mean + b
         X = None if e.X is None else e.X @ se3_exp(delta.at(keys.x))
         moved = replace(e, T=e.T @ se3_exp(z), X=X, places=e.places + places, d=e.d + d)
-        r, _ = self.residuals(moved)
+        return self._with_residuals(moved), float(np.abs(places).max(initial=0.0))
+
+    def _with_residuals(self, e: Estimate) -> Estimate:
+        r, _ = self.residuals(e)
         chi2 = np.full(self.m, np.nan)
         chi2[self.rows] = (r * r).sum(-1)
-        return replace(moved, residual_chi2=chi2), float(np.abs(places).max(initial=0.0))
+        return replace(e, residual_chi2=chi2)
 
     def _ordering(self) -> gtsam.Ordering:
         last = self.keys.x + (0 if self.poses.X0 is None else 1)
@@ -262,11 +265,24 @@ class BatchSmoother:
         time = np.concatenate([np.arange(keys.b - keys.z), end])
         return [*range(keys.z), *(keys.z + np.argsort(time, kind="stable")).tolist()]
 
-    def solve(self, e: Estimate, outlier_chi2: float, max_iterations: int = 8, tolerance_m: float = 2e-5) -> Estimate:
+    def solve(
+        self,
+        e: Estimate,
+        outlier_chi2: float,
+        max_iterations: int = 8,
+        tolerance_m: float = 2e-5,
+        *,
+        is_smoothed: bool = False,
+    ) -> Estimate:
         """Gauss-Newton with truncated least squares at ``outlier_chi2`` (3 degrees of freedom), graduated.
 
         Association gates have kept what is far off: graduation starts where the loss is nearly the truncated one.
+        ``is_smoothed``: the start has been smoothed with heavy tails, so that what is far off has no weight from the
+        first step on: where only odometry ties poses together, one wild point tears the way apart.
         """
+        if is_smoothed:
+            e = self._with_residuals(e)
+            e = replace(e, weight=_truncated_weights(e.residual_chi2, outlier_chi2, 1.0))
         e, _ = self.step(e)
         mu = 1.0
         for _ in range(max_iterations):

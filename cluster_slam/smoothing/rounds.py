@@ -69,7 +69,8 @@ def solve(
     ``in_stretches``: displacements are correlated in time, as covariances need it; places hardly change by it.
     """
     smoother, start = problem(frames, model, world, in_stretches=in_stretches)
-    return smoother, smoother.solve(start, chi2_threshold(3, config.outlier_probability), n_iterations)
+    threshold = chi2_threshold(3, config.outlier_probability)
+    return smoother, smoother.solve(start, threshold, n_iterations, is_smoothed=world.cov_step is not None)
 
 
 def problem(
