@@ -23,6 +23,8 @@ from cluster_slam.records import IntArray
 _NEIGHBOURS = 6  # whose clusters a flower may move to
 _MAX_SWEEPS = 10
 _FEW = 3.0  # clusters
+_PRIOR_SIZES = 4.0  # clusters
+_LOOSE = 0.25  # of the clusters, before the data
 
 
 class Likelihood:
@@ -71,15 +73,17 @@ class Likelihood:
 
 
 def _log_sizes(size: IntArray) -> float:
-    """Log-density of members in no order: as many as a Poisson number from one upwards, but for a share of loose ones.
+    """Log-density of members in no order, given how often each number of members occurs in this partition.
 
-    That share is as the partition itself has it, with a weak prior of one in four.
+    Frequencies of sizes have a Dirichlet prior (as much as ``_PRIOR_SIZES`` clusters would tell) about a Poisson number
+    from one upwards, but for one in four that is loose: plants have sizes of their own, which most clusters share.
     """
-    c = len(size)
-    mean = max(size.mean(), 1.0 + 1e-6)
-    poisson = size * np.log(mean) - mean - np.log1p(-np.exp(-mean))
-    loose = float((np.count_nonzero(size == 1) + 1.0) / (c + 4.0))
-    return float((np.log1p(-loose) + np.logaddexp(poisson, np.where(size == 1, np.log(loose), -np.inf))).sum())
+    c, mean = len(size), max(size.mean(), 1.0 + 1e-6)
+    n, count = np.unique(size, return_counts=True)
+    poisson = np.exp(n * np.log(mean) - mean - gammaln(n + 1.0)) / -np.expm1(-mean)
+    prior = _PRIOR_SIZES * ((1.0 - _LOOSE) * poisson + _LOOSE * (n == 1))
+    frequencies = gammaln(_PRIOR_SIZES) - gammaln(_PRIOR_SIZES + c) + (gammaln(count + prior) - gammaln(prior)).sum()
+    return float(frequencies + (count * gammaln(n + 1.0)).sum())
 
 
 def likeliest_cut(tree: Array, likelihood: Likelihood) -> IntArray:
