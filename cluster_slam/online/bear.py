@@ -49,11 +49,12 @@ def bear(
 
 
 def kind_of_place(world: World, slot: IntArray, missing: IntArray) -> IntArray:
-    """Whether new flowers (k,) stand alone, or beside a known cluster; clusters may be ``missing`` (c,) some."""
+    """Whether new flowers (k,) stand alone, or beside a known cluster, which may move, or be ``missing`` (c,) some."""
     known = np.array([cluster.state != "tentative" for cluster in world.clusters])
     misses = np.zeros(len(known), dtype=np.int64)
     misses[: len(missing)] = missing
-    is_doubtful = misses >= np.bincount(slot, minlength=len(known))
+    moves = np.array([cluster.is_moving for cluster in world.clusters])
+    is_doubtful = moves | (misses >= np.bincount(slot, minlength=len(known)))
     place: IntArray = np.where(known[slot], np.where(is_doubtful[slot], DOUBTFUL, BESIDE), ALONE)
     return place
 

@@ -15,11 +15,11 @@ from cluster_slam.geometry import Array
 from cluster_slam.records import BoolArray, IntArray
 
 _AGO_S = 0.5  # what was in view so long ago, and showed nothing, is not fresh
-ALONE, BESIDE, DOUBTFUL = range(3)  # no cluster near; near one; near one that misses flowers: it may be one of these
+ALONE, BESIDE, DOUBTFUL = range(3)  # no cluster near; near one; near one that sways or misses flowers: perhaps these
 _PRIOR = np.array(  # flowers and false detections that count as known beforehand, by place, seen before or fresh
     [[(1.0, 3.0), (2.0, 1.0)], [(1.0, 1.0), (4.0, 1.0)], [(1.0, 3.0), (1.0, 1.0)]]
 )
-_MEMORY = 200.0  # births after which old ones fade
+_MEMORY = 60.0  # births after which old ones fade
 
 
 class Births:

@@ -97,11 +97,11 @@ def match_tentative(world: World, seen: Seen, view: View, T: Array, w: Array, ro
 
 
 def wander(world: World, rows: IntArray, stamp: float) -> Array:
-    """Variance (k,) of how far flowers may have gone since the last frame, whose cluster is new: it may sway."""
+    """Variance (k,) of how far new flowers may have gone since the last frame, unless their cluster rests."""
     table = world.flowers
-    is_new = np.array([k.state == "tentative" for k in world.clusters])[table.slot[rows]]
+    may_sway = np.array([k.state == "tentative" or k.is_moving for k in world.clusters])[table.slot[rows]]
     far = min(_WANDER_SPEED * world.usual_dt, _WANDER_SHARE * world.spacing)
-    return np.where(is_new & (table.first[rows] < stamp), far * far, 0.0)
+    return np.where(may_sway & (table.first[rows] < stamp), far * far, 0.0)
 
 
 def count_hits(world: World, hit: IntArray, stamp: float) -> None:
