@@ -86,6 +86,22 @@ def test_covariance_of_the_mounting_is_true() -> None:
     assert 0.4 < np.mean(nees) < 1.15
 
 
+def test_errors_that_last_for_a_second_are_in_the_covariance() -> None:
+    """All points of a second are off by the same 3 mm: far more than as many independent ones would leave."""
+    nees, naive = [], []
+    for seed in range(40):
+        rng = np.random.default_rng(100 + seed)
+        seen = still_points(100, 0.001, rng)
+        off = rng.normal(0.0, 0.003, (10, 3))[np.minimum(seen.stamps, 9.99).astype(int)]
+        found = refine_mounting(replace(seen, points=seen.points + off), X_TRUE, np.eye(6))
+        xi = se3_log(inverse(found.X) @ X_TRUE)
+        nees.append(xi @ np.linalg.solve(found.cov, xi) / 6.0)
+        alone = refine_mounting(seen, X_TRUE, np.eye(6)).cov
+        naive.append(xi @ np.linalg.solve(alone, xi) / 6.0)
+    assert np.mean(naive) > 2.0 * np.mean(nees)  # what independent errors would claim
+    assert 0.2 < np.median(nees) * 6.0 / 5.35 < 1.6  # ten stretches tell six parameters' covariance roughly only
+
+
 def test_the_larger_of_two_covariances_holds_both() -> None:
     rng = np.random.default_rng(2)
     for _ in range(20):

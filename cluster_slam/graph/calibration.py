@@ -2,8 +2,8 @@
 
 Points at rest must stand still in the world: the hand-eye transform, the offset between the clocks and the depth scale
 under which they do are the answer. The points' places are eliminated in closed form (variable projection). Residuals of
-one stretch of time err alike (sway, slow errors of arm and detector), so the covariance is a sandwich over stretches
-(White 1980; Liang and Zeger 1986), never smaller than the one that independent errors would have.
+one stretch of time err alike (sway, slow errors of arm and detector), so the covariance is a jackknife over stretches
+(Quenouille 1949; Bell and McCaffrey 2002), never smaller than the one that independent errors would have.
 """
 
 from __future__ import annotations
@@ -166,12 +166,27 @@ def _covariance(J: Array, r: Array, weight: Array, seen: StillPoints, prior: Arr
     H = np.einsum("q,qia,qib->ab", weight, J, J, optimize=True) + prior
     naive: Array = np.linalg.solve(H, np.eye(len(H)))
     cov = 0.5 * (naive + naive.T)
-    score = np.einsum("q,qia,qi->qa", weight, J, r)
     for n in _N_STRETCHES:
-        by_stretch = np.stack([np.bincount(stretches(seen.stamps, n), column, n) for column in score.T], axis=-1)
-        used = max(int((np.abs(by_stretch).sum(1) > 0).sum()), 2)
-        cov = larger(naive @ (by_stretch.T @ by_stretch * used / (used - 1.0) + prior) @ naive, cov)
+        left_out = _without_each(J, r, weight, seen.label, stretches(seen.stamps, n))
+        m, p = left_out.shape
+        few = (m - 1.0) / (m - p) if m > p else 1.0  # m stretches tell a p x p covariance roughly only (Hotelling 1931)
+        if m > 1:
+            cov = larger(few * (m - 1.0) / m * left_out.T @ left_out + naive @ prior @ naive, cov)
     return cov
+
+
+def _without_each(J: Array, r: Array, weight: Array, label: IntArray, stretch: IntArray) -> Array:
+    """By how much (m, p) the answer moves, to first order, where one of the stretches (q,) is left out (jackknife)."""
+    out = []
+    several = np.unique(stretch)
+    for k in several if len(several) > 1 else []:
+        rest = stretch != k
+        w = weight[rest]
+        A, b = J[rest] - _means(J[rest], w, label[rest]), r[rest] - _means(r[rest], w, label[rest])
+        H = np.einsum("q,qia,qib->ab", w, A, A, optimize=True)
+        g = np.einsum("q,qia,qi->a", w, A, b, optimize=True)
+        out.append(np.linalg.solve(H + 1e-9 * np.trace(H) / len(H) * np.eye(len(H)), g))
+    return np.array(out).reshape(len(out), J.shape[2])
 
 
 def larger(a: Array, b: Array) -> Array:

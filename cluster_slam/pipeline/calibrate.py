@@ -29,6 +29,7 @@ SCALE_SIGMA = 0.05  # of the depth scale
 _POOR_SHIFT_M = 0.005  # a direction of the shift that is known no better is worth a word ...
 _POOR_TURN_RAD = 0.009  # ... and so is a turn
 _STILL_RAD = 0.03  # root mean square turn below which the flange has not turned about an axis
+_LITTLE_LEARNT = 0.5  # of the variances before, geometric mean over all directions: more left is poor
 _AXES = ("x", "y", "z")
 
 
@@ -210,11 +211,11 @@ def report_on(
     excitation = _excitation(session)
     advice = _advice(mounting.cov[:6, :6], excitation)
     prior = pose_model(session).cov_hand_eye
-    learnt = np.trace(mounting.cov[:6, :6] @ np.linalg.solve(prior, np.eye(6))) / 6.0
+    left = np.exp((np.linalg.slogdet(mounting.cov[:6, :6])[1] - np.linalg.slogdet(prior)[1]) / 6.0)
     still = bool((excitation < _STILL_RAD).all())
     warnings = list(session.warnings)
     status: Literal["ok", "poor"] = "ok"
-    if still or learnt > 0.5 or len(unobserved) >= 3:
+    if still or left > _LITTLE_LEARNT or len(unobserved) >= 3:
         status = "poor"
         warnings.append("the motions say little of the mounting" + ("; the arm did not turn" if still else ""))
     return CalibrationReport(

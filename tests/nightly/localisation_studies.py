@@ -53,6 +53,8 @@ def _bound(frame: Kidnapped, marks: Landmarks, scale: ErrorScale, seed: int) -> 
     rows = np.flatnonzero(frame.flowers >= 0)
     look = make_look(frame.points, frame.covs, scale)
     fit = solve(look, marks, frame.T_map_camera, rows, frame.flowers[rows], scale, 1)
+    if not np.isfinite(fit.cov).all():
+        return 0.0
     xi = np.random.default_rng([seed, 5]).multivariate_normal(np.zeros(6), fit.cov, _DRAWS)
     near = (np.linalg.norm(xi[:, 3:], axis=1) < 0.01) & (np.linalg.norm(xi[:, :3], axis=1) < np.pi / 180.0)
     return float(near.mean())
