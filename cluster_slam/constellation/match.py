@@ -94,7 +94,7 @@ def match(
         repeated |= again
         candidates += [_Candidate(space, scene, e, _evidence(scene, e, single=single), single) for e in explained]
         by_clusters = _scene(session, alive, space, config, growth, single=False, similarity=similarity)
-        if single and by_clusters is not None:
+        if single and space.d == 3 and by_clusters is not None:  # in a plane two clusters were enough before
             candidates += _together(space, by_clusters, explained)
     if not candidates:
         return Match(plant.name, 0.0, -np.inf, -np.inf, False)
