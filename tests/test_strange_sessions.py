@@ -128,3 +128,32 @@ def test_copies_of_one_frame_end_in_a_word() -> None:
     )
     with pytest.raises(EstimationError, match="do not determine"):
         smooth(still)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_in_one_frame_every_observation_stands(seed: int) -> None:
+    """Forty detections, some of them a millimetre apart: nothing can be confirmed, so nothing is rejected."""
+    made = simulate_session(
+        replace(PRESETS["moderate"], duration_s=0.05, clutter_per_frame=12.0, miss_rate=0.0), seed=seed
+    )
+    observations = made.session.observations
+    first = np.flatnonzero(observations.frame == 0)
+    twice = np.concatenate([first, first[:5]])
+    points = observations.points[twice]
+    points[len(first) :] += 0.001
+    one = replace(
+        made.session,
+        stamps=made.session.stamps[:1],
+        poses=made.session.poses[:1],
+        observations=replace(
+            observations,
+            frame=observations.frame[twice],
+            points=points,
+            covs=observations.covs[twice],
+            scores=observations.scores[twice],
+        ),
+    )
+    result = smooth(one)
+    assert (result.flower_ids >= 0).all()
+    assert len(np.unique(result.flower_ids)) == len(twice)
+    assert set(result.clusters.states) == {"confirmed"}

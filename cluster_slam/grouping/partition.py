@@ -23,8 +23,9 @@ from cluster_slam.records import IntArray
 _NEIGHBOURS = 6  # whose clusters a flower may move to
 _MAX_SWEEPS = 10
 _FEW = 3.0  # clusters
-_PRIOR_SIZES = 4.0  # clusters
+_PRIOR_SIZES = 30.0  # clusters: fewer say nothing certain of what sizes there are
 _LOOSE = 0.25  # of the clusters, before the data
+_USUAL_SIZE = 4.5  # members, before the data
 
 
 class Likelihood:
@@ -34,7 +35,9 @@ class Likelihood:
         """``volume`` m^3 that was looked at, ``spacing`` m to the nearest flower, ``evidence`` (l, l) of motion."""
         sides = np.ptp(places, axis=0)
         self.places = places
-        self.box = float(np.prod(np.maximum(sides, 0.1 * sides.max())))
+        n = max(len(places), 3)
+        # The range of n points in a box is (n - 1) / (n + 1) of its side.
+        self.box = float(np.prod(np.maximum(sides, 0.1 * sides.max()) * (n + 1.0) / (n - 1.0)))
         self.view = volume
         self.log_volume = float(np.log(max(self.box, volume)))
         self.prior_sigma = 0.7 * spacing
@@ -78,7 +81,7 @@ def _log_sizes(size: IntArray) -> float:
     Frequencies of sizes have a Dirichlet prior (as much as ``_PRIOR_SIZES`` clusters would tell) about a Poisson number
     from one upwards, but for one in four that is loose: plants have sizes of their own, which most clusters share.
     """
-    c, mean = len(size), max(size.mean(), 1.0 + 1e-6)
+    c, mean = len(size), _USUAL_SIZE
     n, count = np.unique(size, return_counts=True)
     poisson = np.exp(n * np.log(mean) - mean - gammaln(n + 1.0)) / -np.expm1(-mean)
     prior = _PRIOR_SIZES * ((1.0 - _LOOSE) * poisson + _LOOSE * (n == 1))

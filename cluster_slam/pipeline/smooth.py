@@ -18,6 +18,7 @@ from cluster_slam.smoothing.first import first_world
 from cluster_slam.smoothing.rounds import (
     associate,
     drop_unsupported,
+    let_all_stand,
     mend,
     observations_err_slowly,
     regroup,
@@ -60,7 +61,7 @@ def smooth(
     if world.cov_step is None:  # where drift was followed, the association has been made with it
         world, merged = _associate_and_smooth(stated, stated_poses, world, config, rng, say, clock)
     if world.cov_step is None:
-        world = drop_unsupported(stated, world, config)
+        world = let_all_stand(stated, drop_unsupported(stated, world, config), config)
     say("smoothing all", 0.85)
     frames, model = for_solving(stated, stated_poses, world)
     smoother, estimate = solve(frames, model, world, config, 4)
@@ -68,7 +69,7 @@ def smooth(
     if world.cov_step is None and not world.errs_slowly:
         world = settle(frames, world, smoother, estimate)
     claimed = world.landmark != before
-    world = learn(world, smoother, estimate)
+    world = let_all_stand(frames, learn(world, smoother, estimate), config)
     drifts = world.cov_step is not None
     for i in range(config.max_rounds):
         grouped = world if drifts else regroup(frames, world, config, rng, claimed)
@@ -101,7 +102,7 @@ def _associate_and_smooth(
         frames, model = for_solving(stated, stated_poses, world)
         say(f"associating, round {i + 1}", 0.15 + 0.7 * i / config.max_rounds)
         before = world.landmark
-        world = associate(frames, model, world, config)
+        world = let_all_stand(frames, associate(frames, model, world, config), config)
         clock.lap("association")
         say(f"smoothing, round {i + 1}", 0.15 + 0.7 * (i + 0.6) / config.max_rounds)
         is_last = (

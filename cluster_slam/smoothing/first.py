@@ -20,9 +20,11 @@ from cluster_slam.graph.noise import camera_covs
 from cluster_slam.graph.variance import VarianceFactors
 from cluster_slam.grouping import group_flowers
 from cluster_slam.records import BoolArray, IntArray
+from cluster_slam.smoothing.rounds import solve
 from cluster_slam.smoothing.world import World, fewest_observations, scalar_var, with_variances
 from tracking.gating import chi2_threshold
 
+_ODOMETRY_ROUNDS = 2  # of pieces and poses, which drift the less the longer the pieces
 _CALM_HAND_EYE_RAD = 0.005  # a hand-eye transform known so well does not spoil pieces
 
 
@@ -86,6 +88,10 @@ def world_of_pieces(stated: Frames, stated_poses: PoseModel, config: SmoothConfi
         if factor == 1.0 and (X is None or cov_X[0, 0] + cov_before[0, 0] < _CALM_HAND_EYE_RAD**2):
             break
     T = model.given if X is None else model.given @ X
+    for _ in range(0 if step is None else _ODOMETRY_ROUNDS):
+        T = _smoothed_by_pieces(frames, model, T, X, in_order(pieces.labels, long), noise, config)
+        pieces = build_tracklets(frames, T, relative, config.tracklets)
+        long = in_long_pieces(pieces.labels, shortest)
     w, var, labels = transform(T[frames.frame], frames.points), scalar_var(frames, model), pieces.labels
     radius = 0.65 * spacing(frames, w, var, labels, shortest)
     landmark, places = merge_pieces(w, var, labels, frames.frame, frames.n_frames, radius, shortest)
@@ -94,6 +100,36 @@ def world_of_pieces(stated: Frames, stated_poses: PoseModel, config: SmoothConfi
     presence = presence_of(frames.frame, landmark, len(places), frames.n_frames)
     cluster = group_flowers(places, presence, None, view_volume(frames), config.grouping, rng=rng)
     return World(T, X, landmark, places, cluster, radius, noise, held)
+
+
+def _smoothed_by_pieces(
+    frames: Frames,
+    model: PoseModel,
+    T: Array,
+    X: Array | None,
+    label: IntArray,
+    noise: VarianceFactors,
+    config: SmoothConfig,
+) -> Array:
+    """Poses (n, 4, 4) that drift less: each piece is a flower of its own, which holds the poses of its time together.
+
+    What drift is left from the beginning of a session to its end parts the pieces of a flower by less than flowers
+    stand apart; landmarks, made from them next, close the loops.
+    """
+    known = label >= 0
+    if not known.any():
+        return T
+    w, n = transform(T[frames.frame[known]], frames.points[known]), int(label.max()) + 1
+    places = group_means(w, scalar_var(frames, model)[known], label[known], n).mean
+    alone = World(T, X, label, places, np.arange(n), 1.0, noise, np.zeros((6, 6)))
+    return solve(frames, model, alone, config, 2)[1].T
+
+
+def in_order(labels: IntArray, keep: BoolArray) -> IntArray:
+    """Labels 0, 1, 2 ... of the observations (m,) to keep, -1 for the others."""
+    out = np.full(len(labels), -1, dtype=np.int64)
+    out[keep] = np.unique(labels[keep], return_inverse=True)[1]
+    return out
 
 
 def innovation_factor(chi2: Array) -> float:

@@ -55,6 +55,23 @@ def associate(frames: Frames, model: PoseModel, world: World, config: SmoothConf
     return replace(world, landmark=compact(keep, landmark), places=world.places[keep], cluster=cluster)
 
 
+def let_all_stand(frames: Frames, world: World, config: SmoothConfig) -> World:
+    """In a session of so few frames that nothing can be confirmed, what has no flower becomes one of its own."""
+    free = np.flatnonzero(world.landmark < 0)
+    if fewest_observations(frames, config) > 1 or len(free) == 0:
+        return world
+    n, landmark = len(world.places), world.landmark.copy()
+    landmark[free] = n + np.arange(len(free))
+    new = transform(world.T[frames.frame[free]], frames.points[free])
+    alone = int(world.cluster.max(initial=-1)) + 1 + np.arange(len(free))
+    return replace(
+        world,
+        landmark=landmark,
+        places=np.concatenate([world.places, new]),
+        cluster=np.concatenate([world.cluster, alone]),
+    )
+
+
 def solve(
     frames: Frames,
     model: PoseModel,
