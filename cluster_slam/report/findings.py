@@ -137,6 +137,7 @@ NOISE_WORDS = {
     "pixel": "a flower's place in the picture",
     "depth": "the measured depth",
     "sway": "the plant's sway",
+    "wild_share": "single detections, share with wild errors",
 }
 
 

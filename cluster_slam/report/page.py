@@ -103,13 +103,14 @@ def _noise(result: Result) -> list[dict[str, object]]:
             "unit": _noise_unit(name),
         }
         for name, value in sorted(result.diagnostics.estimated_noise.items())
+        if not name.endswith("_factor")  # the ratio of the row that it belongs to
     ]
 
 
 def _noise_unit(name: str) -> str:
     if name == "pixel":
         return "px"
-    if name.startswith("odometry"):
+    if name.startswith("odometry") or name.endswith("_share"):
         return "ratio"
     if name.endswith("rotation"):
         return "rad"
