@@ -38,7 +38,7 @@ def test_a_live_picture_in_a_real_terminal(tmp_path: Path) -> None:
     master, slave = pty.openpty()
     termios.tcsetwinsize(slave, (40, 120))
     command = [sys.executable, "-m", "cluster_slam.cli", "track", str(session), "-o", str(tmp_path / "out"), "--view"]
-    environment = {**os.environ, "TERM": "xterm-256color"}
+    environment = {k: v for k, v in os.environ.items() if k not in ("COLUMNS", "LINES")} | {"TERM": "xterm-256color"}
     process = subprocess.Popen(
         [*command, "--realtime"], stdin=slave, stdout=slave, stderr=slave, env=environment, close_fds=True
     )

@@ -57,7 +57,10 @@ def picture(update: Update, said: list[str]) -> Table:
     words = ", ".join(f"{n} {state}" for state, n in counts.items())
     table = Table(title=f"{update.stamp:.3f} s   {words}", caption="\n".join(said), caption_justify="left")
     for name in ("cluster", "state", "motion", "flowers", "x m", "y m", "z m", "mm/s", "sigma mm"):
-        table.add_column(name, justify="left" if name in ("state", "motion") else "right")
+        is_word = name in ("state", "motion")
+        table.add_column(
+            name, justify="left" if is_word else "right", no_wrap=is_word, min_width=9 if name == "state" else None
+        )
     order = sorted(range(len(tracks)), key=lambda j: (-int(tracks.seen[j]), int(tracks.ids[j])))
     for j in [j for j in order if tracks.states[j] != "tentative"][:_ROWS]:
         x, y, z = (f"{v:.3f}" for v in tracks.positions[j])
