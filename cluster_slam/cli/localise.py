@@ -104,6 +104,16 @@ def _metrics(found: SessionLocalisation, session: Path) -> dict[str, float | boo
     return {} if truth is None else evaluate_localisation(found, truth).as_json()
 
 
+_WORDS = {  # of the summary; metrics.json has all
+    "ate_rmse_m": "position error, RMS",
+    "ate_rotation_rad": "orientation error, RMS",
+    "within_1cm_1deg": "share within 1 cm, 1 degree",
+    "nees_poses": "NEES / 6 (1 is true)",
+    "cluster_idf1": "IDF1 of clusters",
+    "flower_idf1": "IDF1 of flowers",
+}
+
+
 def _tell(found: SessionLocalisation, metrics: dict[str, float | bool], out: Path) -> None:
     import numpy as np
 
@@ -122,6 +132,5 @@ def _tell(found: SessionLocalisation, metrics: dict[str, float | bool], out: Pat
         var = np.nanmedian(np.diagonal(found.covs[found.is_located], axis1=1, axis2=2), axis=0)
         turn, shift = np.degrees(np.sqrt(var[:3].sum())), 1e3 * np.sqrt(var[3:].sum())
         rows.append(("sure to (one sigma, median)", f"{shift:.2f} mm, {turn:.3f} deg"))
-    words = ", ".join(f"{name} {shown_metric(name, float(value))}" for name, value in metrics.items())
-    rows += [("against the truth", words)] if metrics else []
+    rows += [(words, shown_metric(name, float(metrics[name]))) for name, words in _WORDS.items() if name in metrics]
     print_table(f"cluster-slam localise: {found.status}", [*rows, ("result", str(out))])

@@ -115,9 +115,10 @@ class FlatFollower:
         off = np.where(self.side[:, None, None] > 0, self.places, mirrored) - seen[:, None]
         c, s = np.cos(self.state[:, 2])[:, None], np.sin(self.state[:, 2])[:, None]
         x, y = c * off[..., 0] + s * off[..., 1], c * off[..., 1] - s * off[..., 0]
-        P = np.linalg.inv(S)
-        d2 = (P[0, 0] * x * x + 2.0 * P[0, 1] * x * y + P[1, 1] * y * y).astype(np.float32)
-        peak = 1.0 / (2.0 * np.pi * np.sqrt(np.linalg.det(S)))
+        L = np.linalg.cholesky(S)
+        first = x / L[0, 0]
+        d2 = (first**2 + ((y - L[1, 0] * first) / L[1, 1]) ** 2).astype(np.float32)
+        peak = 1.0 / (2.0 * np.pi * L[0, 0] * L[1, 1])
         narrow, wide = np.exp(-0.5 * d2), np.exp(-0.5 * d2 / _WIDE**2)
         density = peak * ((1.0 - _WIDE_SHARE) * narrow.sum(1) + _WIDE_SHARE / _WIDE**2 * wide.sum(1)) / len(self.places)
         return wide.max(1), density

@@ -61,7 +61,7 @@ def smooth(
     if world.cov_step is None:  # where drift was followed, the association has been made with it
         world, merged = _associate_and_smooth(stated, stated_poses, world, config, rng, say, clock)
     if world.cov_step is None:
-        world = let_all_stand(stated, drop_unsupported(stated, world, config), config)
+        world = drop_unsupported(stated, world, config)
     say("smoothing all", 0.85)
     frames, model = for_solving(stated, stated_poses, world)
     smoother, estimate = solve(frames, model, world, config, 4)
@@ -102,7 +102,7 @@ def _associate_and_smooth(
         frames, model = for_solving(stated, stated_poses, world)
         say(f"associating, round {i + 1}", 0.15 + 0.7 * i / config.max_rounds)
         before = world.landmark
-        world = let_all_stand(frames, associate(frames, model, world, config), config)
+        world = associate(frames, model, world, config)
         clock.lap("association")
         say(f"smoothing, round {i + 1}", 0.15 + 0.7 * (i + 0.6) / config.max_rounds)
         is_last = (

@@ -92,14 +92,21 @@ def world_of_pieces(stated: Frames, stated_poses: PoseModel, config: SmoothConfi
         T = _smoothed_by_pieces(frames, model, T, X, in_order(pieces.labels, long), noise, config)
         pieces = build_tracklets(frames, T, relative, config.tracklets)
         long = in_long_pieces(pieces.labels, shortest)
-    w, var, labels = transform(T[frames.frame], frames.points), scalar_var(frames, model), pieces.labels
-    radius = 0.65 * spacing(frames, w, var, labels, shortest)
-    landmark, places = merge_pieces(w, var, labels, frames.frame, frames.n_frames, radius, shortest)
-    keep = supported(frames, T, places, landmark, fewest_observations(frames, config))
-    landmark, places = compact(keep, landmark), places[keep]
+    landmark, places, radius = _landmarks_of_pieces(frames, model, T, pieces.labels, shortest, config)
     presence = presence_of(frames.frame, landmark, len(places), frames.n_frames)
     cluster = group_flowers(places, presence, None, view_volume(frames), config.grouping, rng=rng)
     return World(T, X, landmark, places, cluster, radius, noise, held)
+
+
+def _landmarks_of_pieces(
+    frames: Frames, model: PoseModel, T: Array, labels: IntArray, shortest: int, config: SmoothConfig
+) -> tuple[IntArray, Array, float]:
+    """Landmark of each observation (m,), places (l, 3), and within what radius pieces were taken for one flower."""
+    w, var = transform(T[frames.frame], frames.points), scalar_var(frames, model)
+    radius = 0.65 * spacing(frames, w, var, labels, shortest)
+    landmark, places = merge_pieces(w, var, labels, frames.frame, frames.n_frames, radius, shortest)
+    keep = supported(frames, T, places, landmark, fewest_observations(frames, config))
+    return compact(keep, landmark), places[keep], radius
 
 
 def _smoothed_by_pieces(
