@@ -17,7 +17,8 @@ from cluster_slam.association.displacement import (
 from cluster_slam.association.frames import Frames, view_volume
 from cluster_slam.association.landmarks import group_means
 from cluster_slam.association.refine import compact, find_overlooked, merge_ghosts, supported
-from cluster_slam.association.templates import REST_SIGMA_M, Follower, combine_directions
+from cluster_slam.association.springs import REST_SIGMA_M
+from cluster_slam.association.templates import Follower, combine_directions
 from cluster_slam.config import SmoothConfig
 from cluster_slam.geometry import transform
 from cluster_slam.graph.batch import BatchSmoother, Estimate, Pairs, PoseModel
@@ -35,14 +36,9 @@ LEAST_WILD = 0.001  # share of wild errors that is always reckoned with
 def associate(frames: Frames, model: PoseModel, world: World, config: SmoothConfig) -> World:
     """Follow the clusters forwards and backwards; each frame of each cluster takes the better of the two."""
     cov, _ = camera_covs(model, world.X)
-    cov_pose = np.tile(cov, (frames.n_frames, 1, 1))
     false = max(int((world.landmark < 0).sum()), 1) / max(frames.n_frames, 1) / view_volume(frames)
-    forward = Follower(frames, world.T, cov_pose, world.places, world.cluster, false, config.follow).run()
-    back = frames.reversed()
-    backward = Follower(back, world.T[::-1], cov_pose, world.places, world.cluster, false, config.follow).run()
-    landmark = np.empty(len(frames), dtype=np.int64)
-    landmark[back.order] = backward.landmark
-    backward = replace(backward, landmark=landmark, score=backward.score[::-1])
+    follower = Follower(frames, world.T, cov, world.places, world.cluster, false, config.follow)
+    forward, backward = follower.run()
     landmark = combine_directions(forward, backward, frames, world.cluster)
     if len(np.unique(world.cluster)) < len(world.places):
         agree = forward.landmark == backward.landmark
