@@ -94,6 +94,16 @@ def test_evidence_of_few_pairs_is_not_diluted_by_the_other_members() -> None:
     assert full(np.zeros(4)) - unknown(np.zeros(4)) == pytest.approx(9.0)  # six pairs, three of them new
 
 
+def test_flowers_without_evidence_do_not_raise_the_weight_of_that_of_others() -> None:
+    """Three flowers known to move as one: joined by others of which nothing is known, their evidence is the same."""
+    places = np.random.default_rng(17).uniform(0.0, 0.1, (6, 3))
+    evidence = np.zeros((6, 6))
+    evidence[:3, :3] = 4.0 * (1.0 - np.eye(3))
+    known, unknown = (Likelihood(places, 0.5, 0.02, e) for e in (csr_matrix(evidence), None))
+    for label in (np.array([0, 0, 0, 1, 1, 1]), np.zeros(6, dtype=np.int64)):
+        assert known(label) - unknown(label) == pytest.approx(8.0)  # three pairs, two of them new
+
+
 def test_likelihood_does_not_depend_on_names() -> None:
     rng = np.random.default_rng(13)
     places = rng.uniform(0, 0.4, (12, 3))

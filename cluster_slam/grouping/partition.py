@@ -2,7 +2,8 @@
 
 Clusters stand anywhere in the space that was looked at; members scatter about their centroid with one sigma for all
 clusters; the number of members is Poisson, and some flowers are loose. To this comes the evidence of each pair within a
-cluster; of the pairs among n members at most n - 1 say something new, so that they weigh no more than that together.
+cluster; of the pairs among n members that pairs tie together at most n - 1 say something new, so that they weigh no
+more than that together. Members of whom no pair is known add nothing to it.
 
 Neither clusters nor members come in an order: the density of c clusters in a volume V is c! / V^c, and that of n
 members n! times their number's probability (a Neyman-Scott process; Daley and Vere-Jones, "An introduction to the
@@ -13,7 +14,8 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
-from scipy.sparse import csr_matrix
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.special import gammaln
 
@@ -55,7 +57,7 @@ class Likelihood:
     def __call__(self, label: IntArray) -> float:
         """Of the clusters that ``label`` (l,) names with any integers."""
         _, label, size = np.unique(label, return_inverse=True, return_counts=True)
-        return self._scatter(label, size) + self._motion(label, size)
+        return self._scatter(label, size) + self._motion(label)
 
     def _scatter(self, label: IntArray, size: IntArray, prior_weight: float = 1.0) -> float:
         """Sigma takes its most probable value; a weak prior keeps it from zero."""
@@ -67,12 +69,14 @@ class Likelihood:
         scatter = -0.5 * dof * np.log(2.0 * np.pi * var) - 0.5 * square / var - 1.5 * np.log(size).sum()
         return float(scatter + gammaln(c + 1.0) - c * self.log_volume + _log_sizes(size))
 
-    def _motion(self, label: IntArray, size: IntArray) -> float:
+    def _motion(self, label: IntArray) -> float:
         within = label[self.row] == label[self.col]
-        of = label[self.row[within]]
-        n_pairs = np.bincount(of, minlength=len(size))
-        weight = np.minimum(1.0, (size - 1.0) / np.maximum(n_pairs, 1))
-        return float((self.evidence[within] * weight[of]).sum())
+        row, n = self.row[within], len(label)
+        tied = coo_matrix((np.ones(len(row), dtype=np.int8), (row, self.col[within])), shape=(n, n))
+        of = connected_components(tied, directed=False)[1]
+        n_tied, n_pairs = np.bincount(of), np.bincount(of[row], minlength=int(of.max()) + 1)
+        weight = np.minimum(1.0, (n_tied - 1.0) / np.maximum(n_pairs, 1))
+        return float((self.evidence[within] * weight[of[row]]).sum())
 
 
 def _log_sizes(size: IntArray) -> float:
