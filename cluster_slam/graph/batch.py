@@ -23,8 +23,10 @@ import numpy as np
 from cluster_slam.association.frames import Frames
 from cluster_slam.errors import EstimationError
 from cluster_slam.geometry import Array, adjoint, inverse, se3_exp, se3_log, skew
+from cluster_slam.graph.elimination import Increments, Linearised, Links, remaining_information, solve_step
 from cluster_slam.records import IntArray
 
+_WEAK = 1e-3  # 1 / m: what is known of a place that nobody saw
 _UNIT = {3: gtsam.noiseModel.Unit.Create(3), 6: gtsam.noiseModel.Unit.Create(6)}
 
 
@@ -103,7 +105,8 @@ class BatchSmoother:
         """``landmark`` (m,) flower of each sorted observation or -1; ``correlation`` observations count as one."""
         self.correlation = correlation
         self.frames, self.poses, self.pairs = frames, poses, pairs
-        self.rows = np.flatnonzero(landmark >= 0)
+        rows = np.flatnonzero(landmark >= 0)
+        self.rows = rows[np.lexsort((pairs.of[rows], frames.frame[rows]))]
         self.landmark = landmark[self.rows]
         self.frame = frames.frame[self.rows]
         self.pair = pairs.of[self.rows]
@@ -113,6 +116,16 @@ class BatchSmoother:
         self.n_places = int(landmark.max(initial=-1)) + 1
         self.keys = _Keys(len(pairs.frame), frames.n_frames, len(pairs.stretch_sigma), self.n_places)
         self.m = len(landmark)
+        self.links = Links(
+            frame=self.frame,
+            pair=self.pair,
+            landmark=self.landmark,
+            pair_frame=pairs.frame,
+            stretch=pairs.stretch,
+            n_frames=frames.n_frames,
+            n_places=self.n_places,
+            n_stretches=len(pairs.stretch_sigma),
+        )
 
     def residuals(self, e: Estimate) -> tuple[Array, Array]:
         """Whitened residuals (q, 3) and predicted camera points (q, 3) of the assigned observations."""
@@ -127,7 +140,7 @@ class BatchSmoother:
         self._add_poses(graph, e)
         self._add_displacements(graph, e)
         self._add_observations(graph, e)
-        weak = np.asfortranarray(1e-3 * np.eye(3))
+        weak = np.asfortranarray(_WEAK * np.eye(3))
         for j in range(self.n_places):
             graph.add(gtsam.JacobianFactor(self.keys.l + j, weak, np.zeros(3), _UNIT[3]))
         return graph
@@ -138,11 +151,15 @@ class BatchSmoother:
         A_z = self.whiten @ np.concatenate([skew(h), np.broadcast_to(-np.eye(3), (len(h), 3, 3))], axis=-1)
         return A_z, self.whiten @ np.swapaxes(e.T[self.frame, :3, :3], 1, 2), r
 
-    def _add_observations(self, graph: gtsam.GaussianFactorGraph, e: Estimate) -> None:
-        A_z, A_l, b = self.whitened(e)
+    def _weighted(self, e: Estimate) -> tuple[Array, Array, Array]:
+        """The same, every observation weighted by its robust weight."""
         root = np.sqrt(e.weight[self.rows] / self.correlation)
+        A_z, A_l, r = self.whitened(e)
+        return root[:, None, None] * A_z, root[:, None, None] * A_l, root[:, None] * r
+
+    def _add_observations(self, graph: gtsam.GaussianFactorGraph, e: Estimate) -> None:
         use = np.flatnonzero(e.weight[self.rows] > 1e-8)
-        A_z, A_l, b = (x[use] * root[use].reshape(-1, *([1] * (x.ndim - 1))) for x in (A_z, A_l, b))
+        A_z, A_l, b = (x[use] for x in self._weighted(e))
         z = (self.keys.z + self.frame[use]).tolist()
         place = (self.keys.l + self.landmark[use]).tolist()
         d = (self.keys.d + self.pair[use]).tolist()
@@ -229,22 +246,65 @@ class BatchSmoother:
     def step(self, e: Estimate) -> tuple[Estimate, float]:
         """One Gauss-Newton step and the size of the largest change of a place, m."""
         try:
-            delta = self.graph(e).optimize(self._ordering())
-        except RuntimeError as error:  # GTSAM's word for it is no answer to a person
+            by = self._by_graph(e) if self.poses.cov_step is not None else solve_step(self.links, self._linearised(e))
+        except (RuntimeError, np.linalg.LinAlgError) as error:  # their words for it are no answer to a person
             raise EstimationError(
                 f"the {len(self.rows)} observations of {self.n_places} flowers do not determine its poses and "
                 "places in numbers: are they copies of each other, or their covariances far from their errors?"
             ) from error
-        keys = self.keys
-        n, p, s = len(e.T), len(e.d), len(self.pairs.stretch_sigma)
-        z = np.array([delta.at(keys.z + i) for i in range(n)])
-        places = np.array([delta.at(keys.l + j) for j in range(self.n_places)]).reshape(-1, 3)
-        d = np.array([delta.at(keys.d + i) for i in range(p)]).reshape(-1, 3)
-        b = np.array([delta.at(keys.b + i) for i in range(s)]).reshape(-1, 3)
-        self._stretch_mean = b if self._stretch_mean is None else self._stretch_mean + b
-        X = None if e.X is None else e.X @ se3_exp(delta.at(keys.x))
-        moved = replace(e, T=e.T @ se3_exp(z), X=X, places=e.places + places, d=e.d + d)
-        return self._with_residuals(moved), float(np.abs(places).max(initial=0.0))
+        self._stretch_mean = by.b if self._stretch_mean is None else self._stretch_mean + by.b
+        X = None if e.X is None else e.X @ se3_exp(by.x)
+        moved = replace(e, T=e.T @ se3_exp(by.z), X=X, places=e.places + by.places, d=e.d + by.d)
+        return self._with_residuals(moved), float(np.abs(by.places).max(initial=0.0))
+
+    def _by_graph(self, e: Estimate) -> Increments:
+        """As GTSAM solves the graph: with odometry each pose depends on the one before."""
+        delta = self.graph(e).optimize(self._ordering())
+        keys, links = self.keys, self.links
+
+        def rows(first: int, n: int, width: int) -> Array:
+            return np.array([delta.at(first + i) for i in range(n)]).reshape(n, width)
+
+        return Increments(
+            z=rows(keys.z, links.n_frames, 6),
+            d=rows(keys.d, len(e.d), 3),
+            b=rows(keys.b, links.n_stretches, 3),
+            places=rows(keys.l, links.n_places, 3),
+            x=np.empty(0) if e.X is None else delta.at(keys.x),
+        )
+
+    def _linearised(self, e: Estimate) -> Linearised:
+        """The same problem as the graph's, for absolute poses."""
+        model, pairs, n = self.poses, self.pairs, len(e.T)
+        A_z, A_l, r = self._weighted(e)
+        mean = np.zeros((len(pairs.stretch_sigma), 3)) if self._stretch_mean is None else self._stretch_mean
+        within = pairs.stretch >= 0
+        d = e.d.copy()
+        d[within] -= mean[pairs.stretch[within]]
+        predicted = model.given if e.X is None else model.given @ e.X
+        W = np.linalg.inv(self._cov_camera(e))
+        error = se3_log(inverse(predicted) @ e.T)
+        by_x = np.empty((n, 6, 0)) if e.X is None else -adjoint(inverse(e.T) @ predicted)
+        zx = W @ by_x
+        x_information, x_vector = np.einsum("nai,naj->ij", by_x, zx), -np.einsum("nai,na->i", zx, error)
+        if e.X is not None and model.X0 is not None:
+            prior = np.linalg.inv(model.cov_hand_eye)
+            x_information, x_vector = x_information + prior, x_vector - prior @ se3_log(inverse(model.X0) @ e.X)
+        return Linearised(
+            A_z=A_z,
+            A_l=A_l,
+            r=r,
+            d=d,
+            d_information=pairs.sigma**-2,
+            b=mean,
+            b_information=pairs.stretch_sigma**-2,
+            z_information=np.broadcast_to(W, (n, 6, 6)),
+            z_vector=-error @ W,
+            zx_information=zx,
+            x_information=x_information,
+            x_vector=x_vector,
+            place_information=_WEAK**2,
+        )
 
     def _with_residuals(self, e: Estimate) -> Estimate:
         r, _ = self.residuals(e)
@@ -295,8 +355,11 @@ class BatchSmoother:
 
     def marginals(self, e: Estimate) -> Marginals:
         """Joint covariance of places and hand-eye transform; all else is eliminated."""
-        _, rest = self.graph(e).eliminatePartialMultifrontal(_in_order(self._of_frames()))
-        H, _ = rest.hessian(_in_order(range(self.keys.l, self.keys.x + (0 if e.X is None else 1))))
+        if self.poses.cov_step is None:
+            H = remaining_information(self.links, self._linearised(e))
+        else:
+            _, rest = self.graph(e).eliminatePartialMultifrontal(_in_order(self._of_frames()))
+            H, _ = rest.hessian(_in_order(range(self.keys.l, self.keys.x + (0 if e.X is None else 1))))
         H = 0.5 * (H + H.T)
         scale = 1.0 / np.sqrt(np.diag(H))
         L = np.linalg.cholesky(H * scale[:, None] * scale)
