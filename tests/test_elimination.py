@@ -12,6 +12,7 @@ from cluster_slam.association.frames import Frames
 from cluster_slam.geometry import Array, inverse, se3_exp, transform
 from cluster_slam.graph.batch import BatchSmoother, Estimate, Pairs, PoseModel
 from cluster_slam.graph.elimination import solve_step
+from cluster_slam.graph.variance import _taken_up
 from cluster_slam.records import IntArray
 
 N_FRAMES, N_PLACES = 70, 9  # several chunks of frames
@@ -108,3 +109,27 @@ def test_nothing_seen_leaves_the_poses_as_they_are_given() -> None:
     moved, change = empty.step(replace(e, places=np.empty((0, 3)), d=np.empty((0, 3))))
     assert change == 0.0
     np.testing.assert_allclose(moved.T, smoother.poses.given, atol=1e-5)  # a Gauss-Newton step from 1e-3 away
+
+
+def test_degrees_of_freedom_that_unknowns_take_are_those_of_each_frame_alone() -> None:
+    """Against the trace of the influence matrix of each frame's own least squares."""
+    smoother, e = _problem(in_stretches=False, hand_eye=True, seed=7)
+    used = np.random.default_rng(7).random(len(smoother.rows)) < 0.9
+    A_z, A_d, _ = smoother.whitened(e)
+    prior = smoother.pose_information(e)
+    poses, displacements = _taken_up(smoother, A_z, A_d, used, prior)
+    by_hand = np.zeros(2)
+    for i in range(N_FRAMES):
+        here = np.flatnonzero(used & (smoother.frame == i))
+        pairs, column = np.unique(smoother.pair[here], return_inverse=True)
+        J = np.zeros((len(here), 3, 6 + 3 * len(pairs)))
+        J[:, :, :6] = A_z[here]
+        for k, c in enumerate(column):
+            J[k, :, 6 + 3 * c : 9 + 3 * c] = A_d[here[k]]
+        J = J.reshape(-1, J.shape[2])
+        P = np.zeros((J.shape[1], J.shape[1]))
+        P[:6, :6] = prior[i]
+        P[6:, 6:] = np.diag(np.repeat(smoother.pairs.total_sigma[pairs] ** -2, 3))
+        taken = np.diag(np.linalg.solve(J.T @ J + P, J.T @ J))
+        by_hand += taken[:6].sum(), taken[6:].sum()
+    np.testing.assert_allclose([poses, displacements], by_hand, rtol=1e-9)

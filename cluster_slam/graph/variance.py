@@ -11,9 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cluster_slam.association.frames import information
+from cluster_slam.association.lanes import sums
 from cluster_slam.geometry import Array, inverse, se3_log
 from cluster_slam.graph.batch import BatchSmoother, Estimate
-from cluster_slam.records import BoolArray, IntArray
+from cluster_slam.records import BoolArray
 
 _LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987)
 _CHI2_3_AT_10 = 0.584  # 10 % quantile of chi-square with three degrees of freedom
@@ -36,23 +38,15 @@ def variance_factors(smoother: BatchSmoother, estimate: Estimate) -> VarianceFac
     A_z, A_d, residual = smoother.whitened(estimate)
     prior = smoother.pose_information(estimate)
     n = len(estimate.T)
-    order = np.argsort(smoother.frame[used], kind="stable")
-    rows = np.flatnonzero(used)[order]
-    bounds = np.searchsorted(smoother.frame[rows], np.arange(n + 1))
-    redundancy_flower, redundancy_pose = -3.0 * smoother.n_places, 0.0
-    for i in range(n):
-        here = rows[bounds[i] : bounds[i + 1]]
-        if len(here) == 0:
-            continue
-        free, posterior = _frame_redundancy(smoother, A_z[here], A_d[here], smoother.pair[here], prior[i])
-        redundancy_flower += free
-        redundancy_pose += 6.0 - float(np.trace(posterior[:6, :6] @ prior[i]))
+    free_poses, free_displacements = _taken_up(smoother, A_z, A_d, used, prior)
+    redundancy_flower = 3.0 * (int(used.sum()) - smoother.n_places) - free_poses - free_displacements
+    redundancy_pose = free_poses
     flower = _ratio(float((residual[used] ** 2).sum()), redundancy_flower)
     pose = 1.0
     if smoother.poses.cov_step is None:
         predicted = smoother.poses.given if estimate.X is None else smoother.poses.given @ estimate.X
         error = se3_log(inverse(predicted) @ estimate.T)
-        seen = np.diff(bounds) > 0
+        seen = np.bincount(smoother.frame[used], minlength=n) > 0
         pose = _ratio(float(np.einsum("ni,nij,nj->", error[seen], prior[seen], error[seen])), redundancy_pose)
     return VarianceFactors(flower, pose, _correlation_factor(smoother, residual, used, n))
 
@@ -74,21 +68,25 @@ def errs_slowly(smoother: BatchSmoother, given: Estimate) -> bool:
     return len(change) >= 30 and float(np.quantile(change, 0.1)) < _LEAST_WHITE * 2.0 * _CHI2_3_AT_10
 
 
-def _frame_redundancy(
-    smoother: BatchSmoother, A_z: Array, A_d: Array, pair: IntArray, prior: Array
-) -> tuple[float, Array]:
-    """Redundancy of one frame's observations, and the covariance of its pose and displacements."""
-    q = len(A_z)
-    pairs, column = np.unique(pair, return_inverse=True)
-    J = np.zeros((q, 3, 6 + 3 * len(pairs)))
-    J[:, :, :6] = A_z
-    J[np.arange(q)[:, None, None], np.arange(3)[:, None], (6 + 3 * column)[:, None, None] + np.arange(3)] = A_d
-    data = np.einsum("qia,qib->ab", J, J)
-    N = data.copy()
-    N[:6, :6] += prior
-    N[range(6, len(N)), range(6, len(N))] += np.repeat(smoother.pairs.total_sigma[pairs] ** -2, 3)
-    posterior = np.linalg.inv(N)
-    return 3.0 * q - float((posterior * data).sum()), posterior
+def _taken_up(smoother: BatchSmoother, A_z: Array, A_d: Array, used: BoolArray, prior: Array) -> tuple[float, float]:
+    """Degrees of freedom that the poses (6 each) and the displacements (3 each) take from the observations.
+
+    What an unknown's posterior keeps of its prior it has not taken; displacements are eliminated from each frame's
+    pose (Schur complement). What nothing was seen of takes none.
+    """
+    A_z, A_d, frame, pair = A_z[used], A_d[used], smoother.frame[used], smoother.pair[used]
+    n, n_pairs = len(prior), len(smoother.pairs.frame)
+    d_prior = smoother.pairs.total_sigma**-2
+    transposed = np.swapaxes(A_d, 1, 2)
+    cov_d = information(sums(transposed @ A_d, pair, n_pairs) + d_prior[:, None, None] * np.eye(3))
+    coupling = sums(transposed @ A_z, pair, n_pairs)
+    by_pose = cov_d @ coupling
+    total = prior + sums(np.swapaxes(A_z, 1, 2) @ A_z, frame, n)
+    cov_z = np.linalg.inv(total - sums(np.swapaxes(coupling, 1, 2) @ by_pose, smoother.pairs.frame, n))
+    cov_d = cov_d + by_pose @ cov_z[smoother.pairs.frame] @ np.swapaxes(by_pose, 1, 2)
+    kept_z = float((cov_z * prior).sum())
+    kept_d = float(np.trace(cov_d, axis1=1, axis2=2) @ d_prior)
+    return 6.0 * n - kept_z, 3.0 * n_pairs - kept_d
 
 
 def _ratio(square: float, redundancy: float) -> float:
