@@ -141,6 +141,33 @@ def test_another_plant() -> None:
         assert decide(moved, [known], CONFIG).refusal is not Refusal.NONE
 
 
+def test_a_mirrored_plant_is_told_from_a_plant() -> None:
+    """A left-handed frame: three flowers of a cluster fit their image, the plant as a whole does not."""
+    for seed in range(3):
+        plant = SeasonPlant(SMALL, seed=seed)
+        known = plant_of(plant.rest().constellation)
+        plant.grow_to(1.0)
+        later = plant.rest().constellation
+        decision = decide(replace(later, flowers=later.flowers * [1.0, 1.0, -1.0]), [known], CONFIG)
+        assert decision.accepted is None
+        assert "left-handed" in decision.reason
+        assert decide(later, [known], CONFIG).accepted is not None
+
+
+def test_half_of_a_flat_scene_is_clutter() -> None:
+    """Eleven of sixteen are eleven of the map's twenty, and that is enough; sixteen anywhere are not."""
+    rng = np.random.default_rng(5)
+    known = np.column_stack([rng.uniform(-0.5, 0.5, (20, 2)), np.ones(20)])
+    view = np.zeros(3)
+    plant = replace(plant_of(session_of(known, np.arange(20), sigma=0.008)), viewpoint=view)
+    seen = known[:11] + rng.normal(0.0, 0.006, (11, 3)) * [1.0, 1.0, 0.0]
+    others = np.column_stack([rng.uniform(-0.5, 0.5, (16, 2)), np.ones(16)])
+    turn = se3_exp(np.array([0.0, 0.0, 0.1, 0.05, 0.02, 0.0]))
+    for points, is_known in ((np.concatenate([seen, others[:5]]), True), (others, False)):
+        session = replace(session_of(transform(turn, points), np.arange(16), 8 * DAY_S, 0.008), viewpoint=view)
+        assert (decide(session, [plant], CONFIG, similarity=True).accepted is not None) == is_known
+
+
 def lattice(seed: int, *, same: bool) -> tuple[Array, Array]:
     """Clusters planted on a grid of 4 x 3 x 2, of one shape or each of its own."""
     rng = np.random.default_rng(seed)

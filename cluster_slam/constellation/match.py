@@ -5,17 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import betaln
 
 from cluster_slam.config import GrowthConfig, MatchConfig
+from cluster_slam.constellation.evidence import evidence_of, is_too_few
 from cluster_slam.constellation.explain import Explained, Scene, explain, matched_pairs, n_flowers, refine
-from cluster_slam.constellation.fit import Pairs, pose_covariance
+from cluster_slam.constellation.fit import Pairs
 from cluster_slam.constellation.growth import DAY_S
 from cluster_slam.constellation.plane import Space, spaces
 from cluster_slam.constellation.poses import Places, best_distinct, guess_poses, quick_scores
 from cluster_slam.constellation.similarity import concatenate
-from cluster_slam.constellation.units import Units, background_of, log_volume, plant_units, session_units
-from cluster_slam.constellation.warp import field_log_density, warped
+from cluster_slam.constellation.units import Units, background_of, plant_units, session_units
+from cluster_slam.constellation.warp import warped
 from cluster_slam.geometry import Array
 from cluster_slam.records import Constellation, PlantMap
 
@@ -25,6 +25,7 @@ N_TOGETHER = 3  # poses of single flowers that are looked at with clusters as un
 MAX_PRIOR = 3.0  # log odds that a cluster is known because the others are: at most so much
 GLANCE_SEEDS, GLANCE_POSES = 10, 300  # of a glance
 LOOKS = 4000  # clusters that are looked at closely, over all poses: large plants need fewer poses to tell
+CLEARLY = 6.0  # log of a Bayes factor: the two counts of what is new are not alike to a few of them
 REPEATED_SHARE = 0.7  # of the centres: a second pose that puts so many on others means a repeated structure
 
 
@@ -92,13 +93,13 @@ def match(
             continue
         explained, again = _search(scene)
         repeated |= again
-        candidates += [_Candidate(space, scene, e, _evidence(scene, e, single=single), single) for e in explained]
+        candidates += [_Candidate(space, scene, e, evidence_of(scene, e, single=single), single) for e in explained]
         by_clusters = _scene(session, alive, space, config, growth, single=False, similarity=similarity)
         if single and space.d == 3 and by_clusters is not None:  # in a plane two clusters were enough before
             candidates += _together(space, by_clusters, explained)
     if not candidates:
         return Match(plant.name, 0.0, -np.inf, -np.inf, False)
-    best = max(candidates, key=lambda c: c.evidence)
+    best = _best(candidates)
     others = [c.evidence for c in candidates if _says_something_else(best, c)]
     name, runner_up = plant.name, max(others, default=-np.inf)
     found = _found(session, alive, best)
@@ -198,68 +199,18 @@ def _together(space: Space, by_clusters: Scene, explained: list[Explained]) -> l
     """The likeliest poses of flowers one by one, with clusters as units: few in common place flowers, not centroids."""
     poses = [e.pose for e in explained[:N_TOGETHER] if n_flowers(e) >= 3]
     found = [refine(by_clusters, e) for e in explain(by_clusters, concatenate(poses))] if poses else []
-    return [_Candidate(space, by_clusters, e, _evidence(by_clusters, e, single=False), False) for e in found]
+    return [_Candidate(space, by_clusters, e, evidence_of(by_clusters, e, single=False), False) for e in found]
 
 
-def _is_too_few(found: Explained, d: int, *, single: bool) -> bool:
-    """Whether what was matched leaves the pose open: three flowers fix it, of two clusters at least."""
-    return len(found) < (d if single or d == 2 else 2) or n_flowers(found) < d
+def _best(candidates: list[_Candidate]) -> _Candidate:
+    """The likeliest; of two that say the same, that of clusters, unless single flowers explain clearly more.
 
-
-def _evidence(scene: Scene, found: Explained, *, single: bool) -> float:
-    """Log likelihood ratio with the pose integrated out (Laplace): the peak times its volume over the prior's.
-
-    The prior is uniform over all turns and over places where the session overlaps the plant.
+    What flowers of a cluster share is in the covariance of its pose, and in who is who.
     """
-    d = scene.query.centres.shape[1]
-    if _is_too_few(found, d, single=single):
-        return -np.inf
-    pairs = _in_three(matched_pairs(scene, found))
-    with_scale = scene.scale_range[0] < scene.scale_range[1]
-    cov = pose_covariance(pairs, float(found.pose.scale[0]), with_scale=with_scale)
-    keep = [0, 1, 2, 3, 4, 5] if d == 3 else [2, 3, 4]
-    _, log_det = np.linalg.slogdet(cov[np.ix_(keep, keep)])
-    turns = np.log(8 * np.pi**2) if d == 3 else np.log(2 * np.pi)
-    volume = 0.5 * len(keep) * np.log(2 * np.pi) + 0.5 * log_det
-    occam = volume - turns - log_volume(scene.known.centres)
-    if with_scale:  # how sharply the scale is known against its range
-        size = np.sqrt(((pairs.a - pairs.a.mean(0)) ** 2).sum() * len(pairs.a) / max(pairs.n_units, 1) / len(pairs.a))
-        sigma = np.sqrt(float(np.median(pairs.var_offset + pairs.variance.mean())) / max(pairs.n_units, 1)) / size
-        occam += min(0.0, np.log(2.5 * sigma / (scene.scale_range[1] - scene.scale_range[0])))
-    ratio = _single_ratio(scene, found) if single else found.log_ratio
-    return float(ratio + min(occam, 0.0) + _shares(scene, found))
-
-
-def _single_ratio(scene: Scene, found: Explained) -> float:
-    """Log likelihood ratio of flowers that were matched one by one: each drifts for itself, or all in a smooth field.
-
-    What is seen and what is new is left to :func:`_shares`.
-    """
-    seen = np.clip(scene.known.seen[found.known, 0], 1e-3, 0.999)
-    alone = found.log_ratio + len(found) * scene.background.n_new - float(np.log(seen).sum())
-    strangers = len(found) * scene.background.log_group_density + float(scene.bonus[found.query].sum())
-    together = field_log_density(scene, found) - strangers
-    return float(np.logaddexp(alone, together) - np.log(2.0))
-
-
-def _shares(scene: Scene, found: Explained) -> float:
-    """What it costs that only some units found a partner, the shares of either side being unknown.
-
-    With a share theta ~ Beta(a, 1), m certain ones of n have the probability B(m + a, n - m + 1) / B(a, 1).
-    """
-    m = len(found)
-    still_there = 1.0 - np.prod(1.0 - np.where(scene.known.groups.mask, scene.known.seen, 0.0), axis=1)
-    n_known = max(float(m), float(still_there.sum()) / scene.config.seen_share)
-    sides = ((float(len(scene.query)), 2.0), (min(n_known, float(len(scene.known))), 4.0))
-    return float(sum(betaln(m + a, n - m + 1.0) - betaln(a, 1.0) for n, a in sides))
-
-
-def _in_three(pairs: Pairs) -> Pairs:
-    """Pairs of a plane as pairs in three dimensions."""
-    if pairs.a.shape[1] == 3:
-        return pairs
-    zero = np.zeros((len(pairs.a), 1))
-    return replace(pairs, a=np.hstack([pairs.a, zero]), b=np.hstack([pairs.b, zero]))
+    best = max(candidates, key=lambda c: c.evidence)
+    alike = [c for c in candidates if not c.single and c.evidence > best.evidence - CLEARLY]
+    alike = [c for c in alike if not _says_something_else(best, c)] if best.single else []
+    return max(alike, key=lambda c: c.evidence, default=best)
 
 
 def _says_something_else(best: _Candidate, other: _Candidate) -> bool:
@@ -292,7 +243,7 @@ def _found(session: Constellation, alive: PlantMap, best: _Candidate) -> Found |
         scene, found = warped(scene, found)
     else:
         scene, found = _with_prior(scene, found)
-    if _is_too_few(found, best.space.d, single=best.single):
+    if is_too_few(found, best.space.d, single=best.single):
         return None
     pose, scale = found.pose, float(found.pose.scale[0])
     row, member = np.nonzero(found.partner >= 0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -16,6 +16,8 @@ from cluster_slam.records import Constellation, PlantMap
 
 FAMILIAR = 2.0  # log odds of a plant that the map has, before looking: most sessions show one
 REPEATED = 0.5  # a rival that explains more than this share of the best evidence is a clone, or a repeated structure
+HALF = 0.5  # of the session's flowers: where fewer found a partner, its mirror image is tried
+OTHER_UNIT = 4.0  # a plant that is so many times as large, or small, as the map's is given in another unit
 N_CLOSE = 6  # plants that are matched in full where the map has many ...
 COMES_NEAR = 0.3  # ... the best two at a glance, and those that reach this share of the best one's score
 
@@ -67,8 +69,35 @@ def decide(
     matches.sort(key=lambda m: -m.evidence)
     probabilities = _probabilities(matches)
     refusal, reason = _refusal(session, plants, matches, config)
+    if matches and _is_doubtful(session, matches[0], alone=len(plants) == 1):
+        plant = next(p for p in moved if p.name == matches[0].name)
+        refusal, reason = _other_hand(session, plant, matches[0], config, similarity) or (refusal, reason)
     accepted = matches[0] if refusal is Refusal.NONE and matches else None
     return Decision(matches, probabilities, accepted, refusal, reason)
+
+
+def _is_doubtful(session: Constellation, best: Match, *, alone: bool) -> bool:
+    """Whether most of a session found no partner on the best plant (or on the only one)."""
+    if best.found is None or best.found.space.d < 3:
+        return alone and best.found is None and len(session.flowers) > 3
+    return len(best.found.pairs.a) < HALF * len(session.flowers)
+
+
+def _other_hand(
+    session: Constellation, plant: PlantMap, best: Match, config: MapConfig, similarity: bool
+) -> tuple[Refusal, str] | None:
+    """A refusal where a session fits a plant clearly better as its mirror image: its frame is left-handed.
+
+    Three flowers are as good as their image: parts of a mirrored plant fit the plant itself.
+    """
+    mirrored = replace(session, flowers=session.flowers * [1.0, 1.0, -1.0])
+    image = match(mirrored, plant, config.match, config.growth, similarity=similarity)
+    if image.found is None or image.found.space.d < 3:
+        return None
+    if image.evidence < max(best.evidence, config.match.evidence) + config.match.margin:
+        return None
+    text = f"no match: {plant.name} fits the mirror image with a log Bayes factor of {image.evidence:.1f}"
+    return Refusal.NO_MATCH, f"{text}, the session itself with {best.evidence:.1f}: is its frame left-handed?"
 
 
 def _worth_a_look(
@@ -123,5 +152,19 @@ def _refusal(
         text = f"ambiguous: the clusters' layout fits {best.name} in several ways, and their flowers none well"
         return Refusal.AMBIGUOUS, f"{text} ({best.evidence:.1f}, wanted {wanted:.1f})"
     text = "nothing fits" if not np.isfinite(best.evidence) else f"the best, {fits}"
-    few = "; too few clusters in common, or another plant"
+    few = f"; too few clusters in common, or another plant{_unit(session, plants)}"
     return Refusal.NO_MATCH, f"no match: {text}, wanted {wanted:.1f}{few}"
+
+
+def _unit(session: Constellation, plants: Sequence[PlantMap]) -> str:
+    """What sizes say about the unit of length; nothing where they are alike."""
+    size, sizes = _spread(session.flowers), [_spread(p.flowers) for p in plants]
+    ratio = size / max(min(sizes, key=lambda s: abs(np.log(max(s, 1e-9) / max(size, 1e-9)))), 1e-9)
+    if 1.0 / OTHER_UNIT < ratio < OTHER_UNIT:
+        return ""
+    return f" (its flowers spread over {ratio:.3g} times what the map has: is it in metres?)"
+
+
+def _spread(points: Array) -> float:
+    """RMS distance from the middle, m."""
+    return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
