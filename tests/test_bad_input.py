@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -193,6 +194,14 @@ def test_camera_missing(tmp_path: Path) -> None:
 def test_a_folder_where_a_file_should_be(tmp_path: Path) -> None:
     folder = write_folder(tmp_path, {"session.toml": TOML, "flowers.csv": FLOWERS, "poses.txt/x": ""})
     with pytest.raises(InputError, match=r"poses.txt: is a folder, expected"):
+        open_session(folder)
+
+
+def test_a_pipe_where_a_file_should_be(tmp_path: Path) -> None:
+    """Nobody need ever write into it: reading would wait for ever."""
+    folder = write_folder(tmp_path, {"session.toml": TOML, "flowers.csv": FLOWERS})
+    os.mkfifo(folder / "poses.txt")
+    with pytest.raises(InputError, match=r"poses.txt: is no file, expected"):
         open_session(folder)
 
 

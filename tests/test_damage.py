@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -97,3 +98,37 @@ def test_a_run_record_of_other_types(result_folder: Path, key: str, value: objec
         write_folder(Path(folder), {**files, "run.json": json.dumps(record)})
         with pytest.raises(InputError, match=rf"run.json: .*{key}"):
             read_result(folder, make(3, n_frames=20).session)
+
+
+def _changed(folder: Path, name: str, change: Callable[[list[str]], list[str]]) -> dict[str, bytes]:
+    """The files of a result, the rows of one of which (without its header) have been changed."""
+    files = {path.name: path.read_bytes() for path in folder.iterdir()}
+    header, *rows = files[name].decode().splitlines()
+    return {**files, name: ("\n".join([header, *change(rows)]) + "\n").encode()}
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "says"),
+    [
+        ("clusters.csv", lambda rows: rows[1:], r"flowers.csv: row \d+: cluster_id is \d+, expected one of those in"),
+        ("clusters.csv", lambda rows: [*rows, rows[0]], r"clusters.csv: row \d+: cluster_id \d+ again, expected"),
+        ("flowers.csv", lambda rows: [rows[0], *rows], r"flowers.csv: row 3: flower_id \d+ again, expected"),
+    ],
+)
+def test_tables_that_contradict_each_other(
+    result_folder: Path, tmp_path: Path, name: str, change: Callable[[list[str]], list[str]], says: str
+) -> None:
+    write_folder(tmp_path, _changed(result_folder, name, change))
+    with pytest.raises(InputError, match=says):
+        read_result(tmp_path, make(3, n_frames=20).session)
+
+
+@pytest.mark.parametrize("name", ["clusters.csv", "flowers.csv"])
+def test_landmarks_stand_in_any_order(result_folder: Path, tmp_path: Path, name: str) -> None:
+    session = make(3, n_frames=20).session
+    write_folder(tmp_path, _changed(result_folder, name, lambda rows: rows[::-1]))
+    turned, straight = read_result(tmp_path, session), read_result(result_folder, session)
+    for a, b in ((turned.clusters, straight.clusters), (turned.flowers, straight.flowers)):
+        np.testing.assert_array_equal(a.ids, b.ids)
+        np.testing.assert_array_equal(a.positions, b.positions)
+    assert turned.clusters.states == straight.clusters.states

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import cast, get_args
 
@@ -52,13 +53,14 @@ def read_result(path: str | Path, session: Session) -> Result:
         raise InputError(f"{folder}: {'is a file' if folder.exists() else 'missing'}, expected a result folder")
     run = read_run(folder / "run.json")
     flower_ids, cluster_ids, diagnostics = _observations(folder / "observations.csv", session, run)
+    clusters = _clusters(folder / "clusters.csv")
     return Result(
         session=session,
         T_world_camera=_trajectory(folder / "trajectory.txt", session),
         flower_ids=flower_ids,
         cluster_ids=cluster_ids,
-        flowers=_flowers(folder / "flowers.csv"),
-        clusters=_clusters(folder / "clusters.csv"),
+        flowers=_flowers(folder / "flowers.csv", clusters),
+        clusters=clusters,
         drift=_drift(folder / "drift.csv", session),
         calibration=_calibration(folder / "calibration.toml"),
         diagnostics=diagnostics,
@@ -114,11 +116,28 @@ def _columns(header: str) -> list[str]:
     return [name for name in header.split(",") if name not in ("state", *DESCRIPTOR)]
 
 
-def _flowers(path: Path) -> Flowers:
-    table = read_table(path, _columns(FLOWER_COLUMNS))
+def _by_id(table: Table, name: str) -> Table:
+    """The rows in the order of their ids, each of which stands there once."""
+    ids = _ints(table, name)
+    order = np.argsort(ids, kind="stable")
+    again = np.flatnonzero(np.diff(ids[order]) == 0)
+    if len(again):
+        raise table.refuse(int(order[again[0] + 1]), f"{name} {ids[order[again[0]]]} again, expected each id once")
+    columns = {column: values[order] for column, values in table.columns.items()}
+    words = {column: [values[k] for k in order] for column, values in table.words.items()}
+    return replace(table, columns=columns, rows=table.rows[order], words=words)
+
+
+def _flowers(path: Path, clusters: Clusters) -> Flowers:
+    table = _by_id(read_table(path, _columns(FLOWER_COLUMNS)), "flower_id")
+    cluster_ids = _ints(table, "cluster_id")
+    strange = np.flatnonzero(~np.isin(cluster_ids, clusters.ids))
+    if len(strange):
+        k = int(strange[0])
+        raise table.refuse(k, f"cluster_id is {cluster_ids[k]}, expected one of those in clusters.csv")
     return Flowers(
         ids=_ints(table, "flower_id"),
-        cluster_ids=_ints(table, "cluster_id"),
+        cluster_ids=cluster_ids,
         positions=table.stack(("x", "y", "z")),
         covs=symmetric(table.stack(POINT_COV)),
         first_seen=table.columns["first_seen"],
@@ -128,7 +147,7 @@ def _flowers(path: Path) -> Flowers:
 
 
 def _clusters(path: Path) -> Clusters:
-    table = read_table(path, _columns(CLUSTER_COLUMNS), DESCRIPTOR, words=("state",))
+    table = _by_id(read_table(path, _columns(CLUSTER_COLUMNS), DESCRIPTOR, words=("state",)), "cluster_id")
     for name in DESCRIPTOR:
         if name not in table.columns:
             raise InputError(f"{path}: row 1: no column '{name}', expected {CLUSTER_COLUMNS}")

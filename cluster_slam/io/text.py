@@ -22,8 +22,10 @@ def read_text(path: Path, what: str) -> str:
     Raises
     ------
     InputError
-        The file is missing, a folder, unreadable, or not UTF-8 text.
+        The file is missing, a folder, a pipe that nobody need ever fill, unreadable, or not UTF-8 text.
     """
+    if path.exists() and not path.is_file() and not path.is_dir() and path.parts[:2] != ("/", "dev"):
+        raise InputError(f"{path}: is no file, expected {what}")  # the shell's own pipes are in /dev
     try:
         data = path.read_bytes()
     except FileNotFoundError:
