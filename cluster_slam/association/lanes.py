@@ -15,7 +15,7 @@ from cluster_slam.association.frames import chi2_and_log_det
 from cluster_slam.geometry import Array
 from cluster_slam.records import IntArray
 
-_RUN_UP = 2.0  # times what is remembered: of a stretch's run-up ...
+_RUN_UP = 1.5  # times what is remembered: of a stretch's run-up ...
 _STRETCH = 3.0  # ... and, times that again, of a stretch
 
 

@@ -95,15 +95,9 @@ class Search:
         """The best hypothesis of each cluster among the points ``free``, of all points w (p, 3) with S (p, 3, 3)."""
         edges = self._edges(free, w, S, point_lane)
         cluster, d, total = self._hypotheses(edges)
-        found = nothing_found(len(self.lost.lane))
         order = np.lexsort((-total, cluster))
-        rank = _rank(cluster[order])
-        for r in range(_N_REFINED):
-            h = order[rank == r]
-            h = h[total[h] >= np.maximum(self.config.min_score, found.score[cluster[h]])]
-            if len(h):
-                found = found.merged(self._refined(cluster[h], d[h], edges))
-        return found
+        h = order[(_rank(cluster[order]) < _N_REFINED) & (total[order] >= self.config.min_score)]
+        return self._refined(cluster[h], d[h], edges) if len(h) else nothing_found(len(self.lost.lane))
 
     def _edges(self, free: IntArray, w: Array, S: Array, point_lane: IntArray) -> _Edges:
         """Flowers with the points that lie within reach of any flower of their cluster, where there are two of both."""
@@ -140,9 +134,9 @@ class Search:
         return cluster[two], d[two], total[two]
 
     def _refined(self, cluster: IntArray, d: Array, edges: _Edges) -> Found:
-        """Displacements from all flowers that fit hypotheses (h,), one a cluster, matched one to one; final scores."""
-        cfg, n = self.config, len(self.lost.lane)
-        h, e = pairs_in_lanes(cluster, edges.cluster, n)
+        """Of hypotheses (h,), displacements from all flowers that fit, matched one to one: the best of each cluster."""
+        cfg = self.config
+        h, e = pairs_in_lanes(cluster, edges.cluster, len(self.lost.lane))
         total = np.tile(np.eye(3), (len(d), 1, 1))
         for scale in (0.5, 1.0):
             gain = _gains(edges.step[e] - d[h], scale * edges.W[e], cfg.match_gain)
@@ -161,13 +155,18 @@ class Search:
         q = np.bincount(h, minlength=len(d))
         total_gain = np.bincount(h, np.maximum(cfg.match_gain - 0.5 * chi2, 0.0), len(d))
         score = total_gain - (self.n_flowers[cluster] - q) + self.log_prior(cluster, d)
-        is_found = (q >= 2) & (score >= cfg.min_score)
-        found = nothing_found(n)
-        found.score[cluster], found.d[cluster], found.cov[cluster] = score, d, information(total)
-        order = np.argsort(h, kind="stable")
-        h, e = h[order], e[order]
-        found = replace(found, cluster=cluster[h], flower=edges.flower[e], point=edges.point[e], chi2=chi2[order])
-        return found.only(_at(cluster, is_found, n))
+        score[(q < 2) | (score < cfg.min_score)] = -np.inf
+        order = np.lexsort((-score, cluster))
+        best = order[run_starts(cluster[order])]
+        found = nothing_found(len(self.lost.lane))
+        found.score[cluster[best]], found.d[cluster[best]] = score[best], d[best]
+        found.cov[cluster[best]] = information(total[best])
+        is_best = np.zeros(len(d), dtype=bool)
+        is_best[best] = np.isfinite(score[best])
+        kept = np.flatnonzero(is_best[h])
+        kept = kept[np.argsort(cluster[h[kept]], kind="stable")]
+        h, e = h[kept], e[kept]
+        return replace(found, cluster=cluster[h], flower=edges.flower[e], point=edges.point[e], chi2=chi2[kept])
 
     def log_prior(self, cluster: IntArray, d: Array) -> Array:
         """Log-likelihood of displacements (h, 3): as the spring predicts, or after a jump."""
@@ -176,12 +175,6 @@ class Search:
         jump = _LOG_JUMP - 0.5 * (step * step).sum(1) / self._jump_sigma[cluster] ** 2
         value: Array = np.maximum(-0.5 * chi2, jump)
         return value
-
-
-def _at(rows: IntArray, values: BoolArray, n: int) -> BoolArray:
-    out = np.zeros(n, dtype=bool)
-    out[rows] = values
-    return out
 
 
 def _rank(sorted_keys: IntArray) -> IntArray:
