@@ -15,8 +15,7 @@ from cluster_slam.association.frames import chi2_and_log_det
 from cluster_slam.geometry import Array
 from cluster_slam.records import IntArray
 
-_RUN_UP = 1.5  # times what is remembered: of a stretch's run-up ...
-_STRETCH = 3.0  # ... and, times that again, of a stretch
+_STRETCH = 3.0  # times its run-up: of a stretch
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,20 +28,23 @@ class Lanes:
     length: IntArray  # steps in all
 
     @classmethod
-    def of(cls, stamps: Array, memory_s: float) -> Lanes:
-        """Both directions of a session, in stretches of about the same number of frames, their run-up by memory."""
+    def of(cls, stamps: Array, run_up_s: float, *, both_ways: bool) -> Lanes:
+        """A session in stretches of about the same number of frames, forwards, or forwards and then backwards."""
         n = len(stamps)
         duration = float(stamps[-1] - stamps[0]) if n > 1 else 0.0
-        count = int(np.clip(duration / (_STRETCH * _RUN_UP * memory_s), 1, max(n, 1)))
+        count = int(np.clip(duration / (_STRETCH * run_up_s), 1, max(n, 1)))
         bounds = np.arange(count + 1) * n // count
         begin, end = bounds[:-1], bounds[1:]
-        before = np.searchsorted(stamps, stamps[begin] - _RUN_UP * memory_s)
-        after = np.searchsorted(stamps, stamps[end - 1] + _RUN_UP * memory_s, side="right") - 1
+        before = np.searchsorted(stamps, stamps[begin] - run_up_s)
+        after = np.searchsorted(stamps, stamps[end - 1] + run_up_s, side="right") - 1
+        forwards = cls(before, np.ones(count, dtype=np.int64), begin - before, end - before)
+        if not both_ways:
+            return forwards
         return cls(
             first=np.concatenate([before, after]),
             way=np.repeat([1, -1], count),
-            run_up=np.concatenate([begin - before, after - end + 1]),
-            length=np.concatenate([end - before, after - begin + 1]),
+            run_up=np.concatenate([forwards.run_up, after - end + 1]),
+            length=np.concatenate([forwards.length, after - begin + 1]),
         )
 
     def at(self, k: int) -> IntArray:

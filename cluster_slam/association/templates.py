@@ -25,6 +25,8 @@ from cluster_slam.config import TemplateConfig
 from cluster_slam.geometry import Array, rotate_cov, se3_exp, transform
 from cluster_slam.records import BoolArray, IntArray
 
+_RUN_UP = 1.5  # times what an unseen cluster is remembered: of a stretch's run-up
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Followed:
@@ -75,7 +77,7 @@ class Follower:
         self.world_cov = rotate_cov(R, frames.covs)
         J = point_jacobian(R, frames.points)
         self.cov_of_pose = J @ cov_pose @ np.swapaxes(J, -1, -2)
-        self.lanes = Lanes.of(frames.stamps, config.forget_s)
+        self.lanes = Lanes.of(frames.stamps, _RUN_UP * config.forget_s, both_ways=True)
         self.springs = Springs(len(self.lanes.first), self.n_clusters, config)
 
     def run(self) -> tuple[Followed, Followed]:

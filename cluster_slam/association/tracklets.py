@@ -10,12 +10,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
-from cluster_slam.association.frames import Frames, chi2_and_log_det, information, point_jacobian
+from cluster_slam.association.frames import Frames, information, point_jacobian
+from cluster_slam.association.lanes import Lanes, assign, near_pairs, ranges
+from cluster_slam.association.pose_correction import solve_pose_corrections
 from cluster_slam.config import TrackletConfig
 from cluster_slam.geometry import Array, adjoint, inverse, rotate_cov, se3_exp, transform
 from cluster_slam.records import BoolArray, IntArray
+
+_RUN_UP = 3.0  # times the longest gap in a piece: of a stretch's run-up
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,79 +52,41 @@ def relative_pose_cov(
     return out
 
 
-def solve_pose_correction(
-    R: Array, c: Array, residual: Array, cov: Array, information_prior: Array, n_iterations: int = 4
-) -> Array:
-    """Tangent z (6,) of one frame's pose such that ``residual`` (q, 3) = target - T c is explained, Cauchy-robust.
-
-    ``cov`` (q, 3, 3) in the world; the prior is zero with information (6, 6).
-    """
-    J = point_jacobian(R, c)
-    W = information(cov)
-    JW = np.swapaxes(J, -1, -2) @ W
-    z: Array = np.zeros(6)
-    for _ in range(n_iterations):
-        r = residual - J @ z
-        weight = 1.0 / (1.0 + np.einsum("qi,qij,qj->q", r, W, r) / 3.0)
-        H = np.tensordot(weight, JW @ J, axes=1) + information_prior
-        g = np.tensordot(weight, (JW @ residual[..., None])[..., 0], axes=1)
-        z = np.linalg.solve(H, g).astype(np.float64)
-    return z
-
-
 class _Pieces:
-    """The living pieces, as arrays that grow by doubling."""
+    """The living pieces of all lanes, sorted by lane."""
 
     def __init__(self) -> None:
         self.position = np.empty((0, 3))
         self.cov = np.empty((0, 3, 3))
         self.label = np.empty(0, dtype=np.int64)
+        self.lane = np.empty(0, dtype=np.int64)
         self.age = np.empty(0, dtype=np.int64)
         self.last_frame = np.empty(0, dtype=np.int64)
 
-    def keep(self, alive: BoolArray) -> None:
-        self.position, self.cov, self.label = self.position[alive], self.cov[alive], self.label[alive]
-        self.age, self.last_frame = self.age[alive], self.last_frame[alive]
+    def keep(self, which: BoolArray | IntArray) -> None:
+        """Only these, in this order."""
+        self.position, self.cov, self.label = self.position[which], self.cov[which], self.label[which]
+        self.lane, self.age, self.last_frame = self.lane[which], self.age[which], self.last_frame[which]
 
-    def add(self, position: Array, cov: Array, label: IntArray, frame: int) -> None:
+    def add(self, position: Array, cov: Array, label: IntArray, lane: IntArray, frame: IntArray) -> None:
+        """New ones, one observation each."""
         self.position = np.concatenate([self.position, position])
         self.cov = np.concatenate([self.cov, cov])
         self.label = np.concatenate([self.label, label])
+        self.lane = np.concatenate([self.lane, lane])
         self.age = np.concatenate([self.age, np.ones(len(label), dtype=np.int64)])
-        self.last_frame = np.concatenate([self.last_frame, np.full(len(label), frame)])
+        self.last_frame = np.concatenate([self.last_frame, frame])
+        self.keep(np.argsort(self.lane, kind="stable"))
 
-    def update(self, rows: IntArray, points: Array, cov: Array, frame: int) -> None:
-        gain = self.cov[rows] @ information(self.cov[rows] + cov)
+    def update(self, rows: IntArray, points: Array, cov: Array, frame: IntArray) -> None:
+        """Observed once more, in ``frame`` (q,)."""
+        P = self.cov[rows]
+        gain = P @ information(P + cov)
         self.position[rows] += (gain @ (points - self.position[rows])[..., None])[..., 0]
-        P = self.cov[rows] - gain @ self.cov[rows]
+        P = P - gain @ P
         self.cov[rows] = 0.5 * (P + np.swapaxes(P, -1, -2))
         self.age[rows] += 1
         self.last_frame[rows] = frame
-
-
-def match(
-    predicted: Array, predicted_cov: Array, points: Array, cov: Array, gate_chi2: float
-) -> tuple[IntArray, IntArray, Array]:
-    """One-to-one assignment (rows, columns, chi2) that gains most, where a pair inside the gate gains gate - chi2."""
-    none = np.empty(0, dtype=np.int64)
-    if len(predicted) == 0 or len(points) == 0:
-        return none, none, np.empty(0)
-    diff = points[None] - predicted[:, None]
-    reach = np.sqrt(gate_chi2 * (np.trace(predicted_cov, axis1=1, axis2=2)[:, None] + np.trace(cov, axis1=1, axis2=2)))
-    rows, cols = np.nonzero((diff * diff).sum(-1) < reach * reach)
-    if len(rows) == 0:
-        return none, none, np.empty(0)
-    chi2, _ = chi2_and_log_det(diff[rows, cols], predicted_cov[rows] + cov[cols])
-    inside = chi2 < gate_chi2
-    rows, cols, chi2 = rows[inside], cols[inside], chi2[inside]
-    used_rows, r = np.unique(rows, return_inverse=True)
-    used_cols, c = np.unique(cols, return_inverse=True)
-    gain = np.zeros((len(used_rows), len(used_cols)))
-    gain[r, c] = gate_chi2 - chi2
-    a, b = linear_sum_assignment(gain, maximize=True)
-    real = gain[a, b] > 0
-    a, b = a[real], b[real]
-    return used_rows[a], used_cols[b], gate_chi2 - gain[a, b]
 
 
 def build_tracklets(frames: Frames, T: Array, cov_pose: Array, config: TrackletConfig) -> Tracklets:
@@ -134,42 +99,103 @@ def build_tracklets(frames: Frames, T: Array, cov_pose: Array, config: TrackletC
     cov_pose : (n, 6, 6) how wrong each may be relative to the frames shortly before, camera frame.
     config : TrackletConfig
     """
-    labels = np.full(len(frames), -1, dtype=np.int64)
-    innovation = np.full(len(frames), np.nan)
-    pieces = _Pieces()
-    n_pieces = 0
-    world = transform(T[frames.frame], frames.points)
-    world_cov = rotate_cov(T[frames.frame, :3, :3], frames.covs)
-    prior_information = np.linalg.inv(cov_pose + 1e-18 * np.eye(6))
-    stamps = frames.stamps
-    for i in range(frames.n_frames):
-        here = frames.of(i)
-        dt = stamps[i] - stamps[i - 1] if i else 0.0
-        alive = (i - pieces.last_frame <= config.max_gap_frames) | (
-            stamps[i] - stamps[pieces.last_frame] <= config.max_gap_s
+    return _Builder(frames, T, cov_pose, config).run()
+
+
+class _Builder:
+    """Builds the pieces of many stretches at once, each with a run-up in which the stretch before is joined."""
+
+    def __init__(self, frames: Frames, T: Array, cov_pose: Array, config: TrackletConfig) -> None:
+        self.frames, self.T, self.cov_pose, self.config = frames, T, cov_pose, config
+        self.prior_information: Array = np.asarray(np.linalg.inv(cov_pose + 1e-18 * np.eye(6)), dtype=np.float64)
+        dt = float(np.median(np.diff(frames.stamps))) if frames.n_frames > 1 else 1.0
+        gap_s = max(config.max_gap_s, config.max_gap_frames * dt)
+        self.lanes = Lanes.of(frames.stamps, _RUN_UP * gap_s, both_ways=False)
+        self.pieces = _Pieces()
+        self.n_pieces = 0
+        self.labels = np.full(len(frames), -1, dtype=np.int64)
+        self.innovation = np.full(len(frames), np.nan)
+        self.joints: list[tuple[IntArray, IntArray]] = []  # rows of run-ups with their labels there
+
+    def run(self) -> Tracklets:
+        """All steps, and the joints."""
+        for k in range(int(self.lanes.length.max(initial=0)) if len(self.frames) else 0):
+            self._step(k)
+        labels, n = self._joined()
+        return Tracklets(labels, n, self.innovation)
+
+    def _step(self, k: int) -> None:
+        """One frame of every lane."""
+        lane, pieces, cfg = np.flatnonzero(k < self.lanes.length), self.pieces, self.config
+        self._forget(k)
+        frame = self.lanes.at(k)[lane]
+        row = ranges(self.frames.starts[frame], np.diff(self.frames.starts)[frame])
+        at = np.repeat(np.arange(len(lane)), np.diff(self.frames.starts)[frame])
+        c, R = self.frames.points[row], self.T[frame, :3, :3]
+        S = rotate_cov(R[at], self.frames.covs[row])
+        w = transform(self.T[frame][at], c)
+        J = point_jacobian(R[at], c)
+        S_pose = S + J @ self.cov_pose[frame][at] @ np.swapaxes(J, -1, -2)
+        of = np.searchsorted(lane, pieces.lane)
+        var = cfg.gate_chi2 * np.trace(pieces.cov, axis1=1, axis2=2)
+        near = near_pairs(
+            pieces.position, var, of, w, cfg.gate_chi2 * np.trace(S_pose, axis1=1, axis2=2), at, len(lane)
         )
-        if not alive.all():
-            pieces.keep(alive)
-        pieces.cov += config.walk_m_per_sqrt_s**2 * dt * np.eye(3)
-        c, w, S = frames.points[here], world[here], world_cov[here]
-        J = point_jacobian(T[i, :3, :3], c)
-        rows, cols, _ = match(
-            pieces.position, pieces.cov, w, S + J @ cov_pose[i] @ np.swapaxes(J, -1, -2), config.gate_chi2
-        )
-        old = pieces.age[rows] >= config.min_age
+        rows, cols, _ = self._assign(near, w, S_pose, of)
+        old = pieces.age[rows] >= cfg.min_age
         if old.any():
-            r, k = rows[old], cols[old]
-            z = solve_pose_correction(
-                T[i, :3, :3], c[k], pieces.position[r] - w[k], pieces.cov[r] + S[k], prior_information[i]
-            )
-            w = transform(T[i] @ se3_exp(z), c)
-        rows, cols, chi2 = match(pieces.position, pieces.cov, w, S, config.gate_chi2)
-        pieces.update(rows, w[cols], S[cols], i)
-        labels[here.start + cols] = pieces.label[rows]
-        innovation[here.start + cols] = chi2
-        fresh = np.setdiff1d(np.arange(len(c)), cols)
-        new_labels = n_pieces + np.arange(len(fresh))
-        labels[here.start + fresh] = new_labels
-        pieces.add(w[fresh], S[fresh], new_labels, i)
-        n_pieces += len(fresh)
-    return Tracklets(labels, n_pieces, innovation)
+            r, q = rows[old], cols[old]
+            residual, cov = pieces.position[r] - w[q], pieces.cov[r] + S[q]
+            z = solve_pose_corrections(R, at[q], c[q], residual, cov, self.prior_information[frame])
+            w = transform((self.T[frame] @ se3_exp(z))[at], c)
+        rows, cols, chi2 = self._assign(near, w, S, of)
+        label = np.full(len(row), -1)
+        label[cols] = pieces.label[rows]
+        pieces.update(rows, w[cols], S[cols], frame[at[cols]])
+        fresh = np.flatnonzero(label < 0)
+        label[fresh] = self.n_pieces + np.arange(len(fresh))
+        self.n_pieces += len(fresh)
+        pieces.add(w[fresh], S[fresh], label[fresh], lane[at[fresh]], frame[at[fresh]])
+        counts = (k >= self.lanes.run_up[lane])[at]
+        self.labels[row[counts]] = label[counts]
+        self.innovation[row[cols][counts[cols]]] = chi2[counts[cols]]
+        self.joints.append((row[~counts], label[~counts]))
+
+    def _forget(self, k: int) -> None:
+        """Leave out the pieces that were not seen for too long, and let the others walk."""
+        pieces, stamps, cfg = self.pieces, self.frames.stamps, self.config
+        now, before = self.lanes.at(k), self.lanes.at(k - 1)
+        frame = now[pieces.lane]
+        alive = frame - pieces.last_frame <= cfg.max_gap_frames
+        alive |= stamps[frame] - stamps[pieces.last_frame] <= cfg.max_gap_s
+        pieces.keep(alive & (k < self.lanes.length)[pieces.lane])
+        dt = (stamps[now] - stamps[before])[pieces.lane]
+        pieces.cov += (cfg.walk_m_per_sqrt_s**2 * dt)[:, None, None] * np.eye(3)
+
+    def _assign(
+        self, near: tuple[IntArray, IntArray], w: Array, S: Array, of: IntArray
+    ) -> tuple[IntArray, IntArray, Array]:
+        rows, cols = near
+        pieces = self.pieces
+        return assign(
+            rows, cols, w[cols] - pieces.position[rows], pieces.cov[rows] + S[cols], self.config.gate_chi2, of
+        )
+
+    def _joined(self) -> tuple[IntArray, int]:
+        """Labels (m,) with each piece that began in a run-up joined to the piece that held its last point there."""
+        none = np.empty(0, dtype=np.int64)
+        row = np.concatenate([none, *(rows for rows, _ in self.joints)])
+        label = np.concatenate([none, *(labels for _, labels in self.joints)])
+        last = np.argsort(-row, kind="stable")
+        _, first = np.unique(label[last], return_index=True)
+        row, label = row[last[first]], label[last[first]]
+        before = self.labels[row]
+        # Of two that want to go on the same piece, the one that was seen last.
+        order = np.argsort(-row, kind="stable")
+        _, first = np.unique(before[order], return_index=True)
+        parent = np.arange(self.n_pieces)
+        parent[label[order[first]]] = before[order[first]]
+        while (parent[parent] != parent).any():
+            parent = parent[parent]
+        used, labels = np.unique(parent[self.labels], return_inverse=True)
+        return labels, len(used)
