@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cluster_slam.geometry import Array, se3_exp, skew, transform
+from cluster_slam.localisation import sway
 from cluster_slam.localisation.landmarks import Landmarks
 from cluster_slam.localisation.scene import ErrorScale, Look
 from cluster_slam.records import IntArray
@@ -29,6 +30,7 @@ class Fit:
     offsets: Array  # (c, 3) displacement of each of the clusters seen, map, m
     offset_vars: Array  # (c,) posterior variance of a displacement, mean over the axes, m^2
     clusters: IntArray  # (c,) which they are
+    swinging: Array  # (c,) probability that each was touched of late
     chi2: Array  # (m,) of each matched point, its cluster's displacement taken out
     log_likelihood: float  # of the matched points at the best pose, displacements integrated out
     redundancy: float  # of the points' errors: what the sum of chi2 would be, were their covariances true
@@ -101,9 +103,8 @@ def solve(
     n = len(clusters)
     points, places = look.points[rows], marks.positions[flowers]
     shared = marks.shared_covs[clusters] + scale.sway_m**2 * np.eye(3)
-    at_rest: Array = _inverse(shared)
-    offsets = np.zeros((n, 3))
-    tie = at_rest
+    offsets, tie = np.zeros((n, 3)), _inverse(shared)
+    swinging, cost = np.zeros(n), 0.0
     tied = np.zeros((6, 6)) if prior is None else prior
     moved = np.zeros(6)
     for _ in range(n_iterations):
@@ -125,7 +126,8 @@ def solve(
         moved = moved + step
         offsets = -(half[..., 6] - half[..., :6] @ step)
         d2 = np.einsum("ca,cab,cb->c", offsets, tie, offsets)
-        used, tie = tie, _tie(data, b - (B @ step), shared, at_rest, scale)
+        used = tie
+        tie, swinging, cost = _tie(data, b - (B @ step), shared, scale)
         if step @ H @ step < _STILL and np.abs(tie - used).max() < _STILL * np.abs(used).max():
             break
     r = transform(T, points) - places - offsets[group]
@@ -144,24 +146,22 @@ def solve(
         offset_vars=np.trace(own + by_pose, axis1=1, axis2=2) / 3.0,
         clusters=clusters,
         chi2=chi2,
-        log_likelihood=-0.5 * (square + log_det + 3.0 * len(rows) * LOG_2PI),
+        log_likelihood=-0.5 * (square + log_det + 3.0 * len(rows) * LOG_2PI) - cost,
+        swinging=swinging,
         redundancy=_redundancy(J, weighted, B, A, data, H + tied + ridge, group, n),
     )
 
 
-def _tie(data: Array, b: Array, shared: Array, at_rest: Array, scale: ErrorScale) -> Array:
+def _tie(data: Array, b: Array, shared: Array, scale: ErrorScale) -> tuple[Array, Array, float]:
     """Information (c, 3, 3) that ties each displacement to zero, from what the cluster's own points say of it.
 
-    Sway is a mixture of two normal distributions: most clusters hang still, a few have just been touched.
+    Also the probability (c,) that each swings, and what it costs the evidence to say so.
     """
-    spread: Array = _inverse(data)
     alone: Array = np.asarray(np.linalg.solve(data, -b[..., None])[..., 0], dtype=np.float64)
-    touched: Array = shared + scale.touched_m**2 * np.eye(3)
-    log_calm = matching_log_likelihood(alone, shared + spread) + np.log1p(-scale.touched_share)
-    log_touched = matching_log_likelihood(alone, touched + spread) + np.log(scale.touched_share)
-    share = 1.0 / (1.0 + np.exp(np.clip(log_calm - log_touched, -50.0, 50.0)))[:, None, None]
-    out: Array = (1.0 - share) * at_rest + share * _inverse(touched)
-    return out
+    p, prior = sway.shares(alone, shared + _inverse(data), scale)
+    total = shared[:, None] + sway.variances(scale)[:, None, None] * np.eye(3)
+    information = np.asarray(np.linalg.solve(total, np.broadcast_to(np.eye(3), total.shape)), dtype=np.float64)
+    return np.einsum("ck,ckij->cij", p, information), p[:, 1:].sum(axis=1), sway.surprise(p, prior)
 
 
 def _inverse(covs: Array) -> Array:

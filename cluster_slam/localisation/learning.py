@@ -17,6 +17,7 @@ from cluster_slam.localisation.landmarks import Landmarks
 from cluster_slam.localisation.scene import ErrorScale, Look, make_look
 
 _PRIOR_DOF = 10.0  # so many degrees of freedom the prior counts for: a frame or two
+_PRIOR_CLUSTERS = 20.0  # so many the prior of the share of touched clusters counts for
 _N_ROUNDS = 6
 _LEAST_SWAY = 0.02  # of the prior: a plant in still air, or made of tubes
 _RANGE = (0.01, 100.0)  # of factors on stated variances
@@ -57,7 +58,12 @@ def learn_scale(seen: Sequence[Seen], prior: ErrorScale) -> ErrorScale:
             )
             for s, f in zip(seen, fits, strict=True)
         ]
-    return replace(scale, detection=_detection(seen, prior), unmapped=_unmapped(seen, prior))
+    return replace(
+        scale,
+        detection=_detection(seen, prior),
+        unmapped=_unmapped(seen, prior),
+        touched_share=_touched(fits, prior),
+    )
 
 
 def _flower_ratio(fits: Sequence[Fit]) -> float:
@@ -75,10 +81,17 @@ def _sway(seen: Sequence[Seen], fits: Sequence[Fit], scale: ErrorScale) -> float
         gained = np.maximum(total - f.offset_vars, 0.0) / total  # share of a displacement that the frame shows
         square = (f.offsets**2).sum(1) / total
         usual = square < 16.0 * np.maximum(gained, 0.05)  # beyond, it was touched
-        weight = (prior / total)[usual]  # what the map itself may be wrong by says nothing of sway
+        weight = ((1.0 - f.swinging) * prior / total)[usual]  # what the map itself may be wrong by says nothing of sway
         observed += float((weight * square[usual]).sum())
         expected += float((weight * 3.0 * gained[usual]).sum())
     return float(np.sqrt(prior * (observed + _PRIOR_DOF) / (expected + _PRIOR_DOF)))
+
+
+def _touched(fits: Sequence[Fit], prior: ErrorScale) -> float:
+    """Share of the clusters that swing after a touch."""
+    swinging = sum(float(f.swinging.sum()) for f in fits)
+    n = sum(len(f.swinging) for f in fits)
+    return (swinging + _PRIOR_CLUSTERS * prior.touched_share) / (n + _PRIOR_CLUSTERS)
 
 
 def _detection(seen: Sequence[Seen], prior: ErrorScale) -> float:

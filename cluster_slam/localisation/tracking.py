@@ -13,13 +13,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cluster_slam.geometry import Array, adjoint, inverse, se3_exp, se3_log, skew, transform
+from cluster_slam.localisation import sway
 from cluster_slam.localisation.fit import GATE_CHI2, LOG_2PI
 from cluster_slam.localisation.landmarks import Landmarks
 from cluster_slam.localisation.motion import Motion
 from cluster_slam.localisation.scene import ErrorScale, Look
 from cluster_slam.records import IntArray
 from tracking.assignment import assign
-from tracking.gating import chi2_threshold, mahalanobis_sq
+from tracking.gating import mahalanobis_sq
 
 _DIFFUSE = np.repeat([0.3, 0.3], 3)  # rad, m: of T_map_world about a first guess, next to nothing
 _CALM_DOWN_S = 1.5  # a shaken cluster is taken to swing for about so long
@@ -193,7 +194,8 @@ class Track:
             PH = P0 @ H.T
             S = H @ PH + V
             if iteration == 0:
-                self._shake(S, innovation, flowers, P0)
+                V_points = np.stack([V[k : k + 3, k : k + 3] for k in range(0, len(V), 3)])
+                self._shake(S, V_points, innovation, flowers, P0)
                 PH = P0 @ H.T
                 S = H @ PH + V
             L = np.linalg.cholesky(S)
@@ -211,16 +213,25 @@ class Track:
             c.swing_m = max(c.swing_m, float(np.linalg.norm(self.d[at : at + 3])) - 2.0 * self.scale.sway_m, 0.0)
         return log_likelihood, nis
 
-    def _shake(self, S: Array, innovation: Array, flowers: IntArray, P: Array) -> None:
-        """Clusters whose points are off together have been shaken: their sway may be anything (P grows in place)."""
-        cluster = np.repeat(self.marks.cluster[flowers], 3)
-        for one in np.unique(cluster).tolist():
-            here = np.flatnonzero(cluster == one)
-            r = innovation[here]
-            if r @ np.linalg.solve(S[np.ix_(here, here)], r) > chi2_threshold(len(here), 0.9995):
-                c = self.clusters[one]
-                c.swing_m = max(c.swing_m, 0.5 * self.scale.touched_m)
-                P[range(c.at + 3, c.at + 6), range(c.at + 3, c.at + 6)] += self.scale.touched_m**2
+    def _shake(self, S: Array, V: Array, innovation: Array, flowers: IntArray, P: Array) -> None:
+        """Clusters whose points are off together swing: their sway may be as large as that (P grows in place)."""
+        of = self.marks.cluster[flowers]
+        clusters = np.unique(of)
+        means, covs = np.zeros((len(clusters), 3)), np.zeros((len(clusters), 3, 3))
+        for k, cluster in enumerate(clusters.tolist()):
+            rows = np.flatnonzero(of == cluster)
+            here = (3 * rows[:, None] + np.arange(3)).ravel()
+            information = np.linalg.solve(V[rows], np.broadcast_to(np.eye(3), (len(rows), 3, 3)))
+            mean = np.linalg.solve(information.sum(0), np.hstack(list(information)))
+            means[k], covs[k] = mean @ innovation[here], mean @ S[np.ix_(here, here)] @ mean.T
+        p, _ = sway.shares(means, covs, self.scale)
+        usual = np.trace(covs, axis1=1, axis2=2)[:, None] / 3.0
+        added = 1.0 / (p / (usual + sway.variances(self.scale))).sum(axis=1) - usual[:, 0]
+        for k, cluster in enumerate(clusters.tolist()):
+            c = self.clusters[cluster]
+            if p[k, 0] < 0.5:
+                c.swing_m = max(c.swing_m, float(np.sqrt(added[k])))
+            P[range(c.at + 3, c.at + 6), range(c.at + 3, c.at + 6)] += added[k]
 
     def _linearised(self, look: Look, rows: IntArray, flowers: IntArray) -> tuple[Array, Array, Array]:
         """Jacobian (3 m, d), residuals (3 m,) and covariance (3 m, 3 m) of the matched points in the camera frame."""

@@ -238,13 +238,13 @@ def _on_floor(frames: _Frames, flat: Flat, marks: Landmarks, seed: int, say: Pro
     """Frames of a vehicle on a floor, one after the other."""
     say("finding what the instruments err by", 0.05)
     right = corrected(frames.session)
-    follower = FlatFollower(flat, marks, motion_of(right.session), np.random.default_rng(seed))
-    o, out = right.session.observations, []
+    follower = FlatFollower(flat, marks, motion_of(right), np.random.default_rng(seed))
+    o, out = right.observations, []
     for i in _told(frames.session.n_frames, say):
         p = follower.step(i, o.points[frames.rows[i]], o.covs[frames.rows[i]])
-        T, cov = right.on_time(i, p.T_map_camera, p.cov)
+        one = (p.probability, p.T_map_camera)
         out.append(
-            Place(p.reason, marks.plant, p.probability, T, cov, p.flower_ids, p.cluster_ids, ((p.probability, T),))
+            Place(p.reason, marks.plant, p.probability, p.T_map_camera, p.cov, p.flower_ids, p.cluster_ids, (one,))
         )
     return out
 
