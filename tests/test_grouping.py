@@ -111,3 +111,23 @@ def test_likelihood_does_not_depend_on_names() -> None:
     evidence = csr_matrix(np.where(np.eye(12) > 0, 0.0, 1.0))
     likelihood = Likelihood(places, 0.5, 0.05, evidence)
     assert likelihood(label) == pytest.approx(likelihood(7 - 2 * label), abs=1e-9)
+
+
+def test_flowers_that_are_often_missed_come_in_clusters_all_the_same() -> None:
+    """Each is found in half of the frames that show its cluster: by chance, or as it is hidden for a while."""
+    rng = np.random.default_rng(2)
+    middles = np.repeat(np.array([[0.0, 0, 1], [0.5, 0, 1], [0.0, 0.5, 1], [0.5, 0.5, 1]]), 4, axis=0)
+    places = middles + 0.015 * rng.standard_normal((16, 3))
+    share = np.tile([1.0, 0.9, 0.5, 0.25], 4)
+    seen = rng.random((16, N_FRAMES)) < share[:, None]
+    label = group_flowers(places, csr_matrix(1.0 * seen), None, 0.5, GroupingConfig(), rng=rng)
+    np.testing.assert_array_equal(label, np.repeat(np.arange(4), 4))
+
+
+def test_flowers_that_are_seen_one_by_one_come_in_no_clusters() -> None:
+    rng = np.random.default_rng(2)
+    places = np.repeat(np.eye(4, 3), 4, axis=0) + 0.015 * rng.standard_normal((16, 3))
+    order = rng.integers(16, size=N_FRAMES)
+    seen = csr_matrix((np.ones(N_FRAMES), (order, np.arange(N_FRAMES))), shape=(16, N_FRAMES))
+    label = group_flowers(places, seen, None, 0.5, GroupingConfig(), rng=rng)
+    np.testing.assert_array_equal(label, np.arange(16))
