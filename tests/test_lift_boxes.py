@@ -189,3 +189,35 @@ def test_no_boxes() -> None:
 def test_every_camera_has_a_model() -> None:
     for name in DEPTH_CAMERAS:
         assert depth_model(name, focal_px=430.0).near_m < 0.2
+
+
+def test_a_flower_that_is_mostly_hidden_has_no_depth() -> None:
+    """Half of it behind a leaf that ends in its box: which of the two depths is the flower's is a guess."""
+    whole, hidden = scene(), scene()
+    hidden[:, 58:] = 0.30
+    v, u = np.mgrid[:100, :120]
+    petals = np.where((u - 60) ** 2 + (v - 50) ** 2 <= 81, 200, 60).astype(np.uint8)
+    image = np.repeat(petals[..., None], 3, axis=2)
+    hidden_image = image.copy()
+    hidden_image[:, 58:] = (30, 120, 30)
+    boxes = ImageDetections(BOX[0][None], BOX[1][None], np.ones(1))
+    camera = Camera(430.0, 430.0, 60.0, 50.0, np.zeros(8), 120, 100)
+    for depth, picture, is_lifted in ((whole, image, True), (hidden, hidden_image, False)):
+        found = lift_boxes(
+            camera, boxes, depth, convention="z", model=EXACT, sigma_px=np.ones(1), image=picture
+        )  # fmt: skip
+        assert found.is_lifted[0] == is_lifted
+
+
+def test_wide_boxes_are_no_hidden_flowers() -> None:
+    """Where a detector's boxes are all half as wide again as the flowers, nothing is refused for it."""
+    v, u = np.mgrid[:100, :420]
+    middles = np.column_stack([np.arange(40, 400, 60), np.full(6, 50)]).astype(float)
+    is_petal = ((u[..., None] - middles[:, 0]) ** 2 + (v[..., None] - middles[:, 1]) ** 2 <= 81).any(-1)
+    depth = np.where(is_petal, 0.40, 0.70)
+    image = np.repeat(np.where(is_petal, 200, 60).astype(np.uint8)[..., None], 3, axis=2)
+    boxes = ImageDetections(middles, np.full((6, 2), 27.0), np.ones(6))
+    camera = Camera(430.0, 430.0, 210.0, 50.0, np.zeros(8), 420, 100)
+    found = lift_boxes(camera, boxes, depth, convention="z", model=EXACT, sigma_px=np.ones(6), image=image)
+    assert found.is_lifted.all()
+    np.testing.assert_allclose(found.depths, 0.40, atol=1e-3)

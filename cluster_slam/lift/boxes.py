@@ -16,6 +16,7 @@ from cluster_slam.sensors.depth import DepthModel
 
 _ALIKE = 1.8  # flowers of one picture differ in width by less than this factor from the middle one
 _MIN_ALIKE = 5  # flowers that say what is usual
+_SEEN = 0.65  # share of a box that is petals with a depth; below, one depth in five is of what hides the rest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +72,7 @@ def lift_boxes(
     slopes = np.array([(f.slope_u, f.slope_v) for f in found]).reshape(-1, 2)
     points, covs = np.full((len(found), 3), np.nan), np.full((len(found), 3, 3), np.nan)
     good = np.isfinite(depths) & _are_alike(boxes.sizes.max(axis=1, initial=0.0) * depths)
+    good &= _are_seen(np.array([f.seen for f in found]), np.isfinite(depths))
     if good.any():
         points[good], covs[good] = lift_unscented(
             camera,
@@ -103,3 +105,10 @@ def _are_alike(widths: Array) -> BoolArray:
     with np.errstate(divide="ignore", invalid="ignore"):
         alike: BoolArray = ~(np.abs(np.log(widths / np.median(known))) > np.log(_ALIKE))
     return alike
+
+
+def _are_seen(shares: Array, known: BoolArray) -> BoolArray:
+    """Which flowers are hidden so little that the depth is theirs, by what is usual: some detectors' boxes are wide."""
+    usual = float(np.quantile(shares[known], 0.8)) if known.sum() >= _MIN_ALIKE else 1.0
+    seen: BoolArray = shares >= _SEEN * min(usual, 1.0)
+    return seen

@@ -8,7 +8,7 @@ depth at the middle, whatever part of the flower is hidden.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,7 @@ class PetalDepth:
     sigma: float  # m
     slope_u: float  # m / px
     slope_v: float
+    seen: float = 0.0  # share of the box's ellipse that is petals with a depth
 
 
 NO_DEPTH = PetalDepth(np.nan, np.nan, 0.0, 0.0)
@@ -79,7 +80,7 @@ def petal_depth(
     if petals.sum() < 3:
         return NO_DEPTH
     u, v, z, weight = patch.u[petals], patch.v[petals], patch.z[petals], patch.weight[petals]
-    return _plane(u, v, z, weight, width_px, focal_px, model)
+    return replace(_plane(u, v, z, weight, width_px, focal_px, model), seen=float(petals.sum()) / patch.area)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +93,7 @@ class _Patch:
     weight: Array  # (n,) falls from the middle; sums to 1 where all pixels are valid
     ring: Array  # (m,) m, increasing
     n_ring: int  # pixels of the ring, valid or not
+    area: float  # of the ellipse, pixels
 
 
 def _patch(depth: Array, centre: Array, size: Array, image: NDArray[np.uint8] | None, others: Array) -> _Patch:
@@ -118,6 +120,7 @@ def _patch(depth: Array, centre: Array, size: Array, image: NDArray[np.uint8] | 
         weight[valid] / whole,
         np.sort(patch[about & (patch > 0)].astype(float)),
         int(about.sum()),
+        float(np.pi * half.prod()),
     )
 
 
