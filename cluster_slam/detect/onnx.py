@@ -93,6 +93,7 @@ class OnnxDetector:
         """See :func:`open_onnx`."""
         self.kind, self.signature = kind, signature
         self._session, self._prompt = session, prompt
+        self._config = preprocessor_config(signature.path)
         self._classes = _flower_classes(signature, kind)
         stated = signature.metadata.get("score")
         self._least = score if score is not None else float(stated) if stated else _LEAST.get(kind, 0.4)
@@ -125,10 +126,9 @@ class OnnxDetector:
 
     def _scaling(self, image: NDArray[np.uint8]) -> Scaling:
         """How the model wants this picture."""
-        config = preprocessor_config(self.signature.path)
         plain = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
         is_normal = self.kind is Kind.GROUNDING_DINO or self.signature.output("dets") is not None
-        values = values_of(config, (IMAGENET_MEAN, IMAGENET_STD) if is_normal else plain)
+        values = values_of(self._config, (IMAGENET_MEAN, IMAGENET_STD) if is_normal else plain)
         height, width = self.signature.image.shape[2:4]
         keeps = self.kind in (Kind.YOLO, Kind.END_TO_END)
         if isinstance(height, int) and isinstance(width, int):
