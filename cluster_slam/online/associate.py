@@ -11,14 +11,18 @@ from cluster_slam.geometry import Array, se3_exp, transform
 from cluster_slam.online.matching import Matches, match
 from cluster_slam.online.pose import PoseSolution, no_pose, solve_pose
 from cluster_slam.online.search import Scene, find_moved, with_moved
+from cluster_slam.online.strays import find_strays
 from cluster_slam.online.world import Snapshot, World
 from cluster_slam.records import IntArray
+from tracking.motion import touch_noise
 
 _NEAR_VIEW = 0.15  # of x / z: moving clusters so far outside of the view are still followed
 _VIEW = 0.02
+_JUMP_SIGMA_M = 0.005  # of a displacement that the search has found, before the frame's own pose is known
 _LONG_S = 0.5  # a cluster unseen for longer is searched for ...
 _SOMETIMES = 5  # ... in one of so many frames
-_JUMP_SIGMA_M = 0.005  # of a displacement that the search has found, before the frame's own pose is known
+_STRAY_S = 0.25  # a flower unseen for longer may be anywhere
+_YOUNG_SHARE = 0.3  # of how close flowers stand: a point so near to where a new flower was seen is that one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,6 +77,10 @@ def associate(world: World, view: View, cov_hand_eye: Array) -> Seen:
     if better is not None:
         found, at = better, world.snapshot(view.stamp)
         predicted = world.expected(rows, at)
+    better = with_strays(world, view, rows, found, predicted, P, moved, at)
+    if better is not None:
+        found, at = better, world.snapshot(view.stamp)
+        predicted = world.expected(rows, at)
     return Seen(rows[found.rows], found.cols, found.chi2, pose_of(found), at)
 
 
@@ -108,15 +116,48 @@ def search(
         return None
     for slot, moved in found.items():
         if moved.is_jump:
-            jump(world, slot, moved.d, at, view.stamp)
+            jump(world, slot, moved.d, at, "it was found elsewhere, by its shape", view.stamp)
     after = with_moved(before, found, slots[flowers], len(w))
     return replace(after, rows=flowers[after.rows])
 
 
-def jump(world: World, slot: int, d: Array, at: Snapshot, stamp: float) -> None:
+def with_strays(
+    world: World, view: View, rows: IntArray, found: Matches, predicted: Array, P: Array, w: Array, at: Snapshot
+) -> Matches | None:
+    """More matches, of flowers that are alone: one that is missed may be a point nearby that nobody claims."""
+    table = world.flowers
+    slot = table.slot[rows]
+    unclaimed = np.ones(len(w), dtype=bool)
+    unclaimed[found.cols] = False
+    world.note_unclaimed(int(unclaimed.sum()))
+    missed = np.bincount(slot, minlength=len(world.clusters))[slot] == 1
+    missed[found.rows] = False
+    unseen_s = view.stamp - table.last[rows]
+    lost = np.flatnonzero(missed & (unseen_s < _STRAY_S) & world.in_view(view.T, predicted, 0.0))
+    young = np.flatnonzero(~table.confirmed & (table.n > 1))
+    if len(lost) and len(young) and len(w):
+        gap = np.linalg.norm(w[:, None] - world.expected(young, at)[None], axis=-1)
+        unclaimed &= gap.min(1) > _YOUNG_SHARE * min(world.spacing, 0.1)
+    free = np.flatnonzero(unclaimed)
+    if not (len(lost) and len(free)):
+        return None
+    touch = np.array([touch_noise(t, world.motion)[:3, :3] for t in unseen_s[lost]])
+    r, c = find_strays(predicted[lost], P[lost] + touch, w[free], view.S[free], world.unclaimed_density())
+    if not len(r):
+        return None
+    r, c = lost[r], free[c]
+    for row, col in zip(r.tolist(), c.tolist(), strict=True):
+        d = w[col] - predicted[row] + at.d[slot[row]]
+        jump(world, int(slot[row]), d, at, "it was found elsewhere, the likeliest of what is near", view.stamp)
+    return Matches(
+        np.concatenate([found.rows, r]), np.concatenate([found.cols, c]), np.concatenate([found.chi2, np.zeros(len(r))])
+    )
+
+
+def jump(world: World, slot: int, d: Array, at: Snapshot, reason: str, stamp: float) -> None:
     """A cluster was found where nobody would have predicted it: it is followed from there."""
     cluster, velocity = world.clusters[slot], None
     if at.unseen_s[slot] < 1.5 * world.usual_dt:
         velocity = cluster.velocity + (d - at.d[slot]) / max(at.unseen_s[slot], 1e-6)
     cov, speed = _JUMP_SIGMA_M**2 * np.eye(3), world.config.follow.jump_speed
-    cluster.jump(d, cov, speed, velocity, "it was found elsewhere, by its shape", stamp)
+    cluster.jump(d, cov, speed, velocity, reason, stamp)

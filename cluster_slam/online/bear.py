@@ -37,26 +37,28 @@ def bear(
     if not len(left):
         return
     note_spacing(world, w)
-    slot = slots_for(world, w, left, known, row_of, view.stamp)
+    slot, beside = slots_for(world, w, left, known, row_of, view.stamp)
     d = np.zeros((len(world.clusters), 3))
     d[: len(seen.at.d)] = seen.at.d
     J = point_jacobian(T[:3, :3], view.c[left])
     cov = view.S[left] + J @ seen.pose.cov @ np.swapaxes(J, 1, 2)
-    kind = world.births.kind(kind_of_place(world, slot, missing), is_fresh(world, w[left]))
+    kind = world.births.kind(kind_of_place(world, slot, missing, beside), is_fresh(world, w[left]))
     row_of[left] = world.flowers.add(w[left] - d[slot], cov, J, slot, view.stamp)
     world.flowers.kind[row_of[left]] = kind
     world.place_anchors(np.unique(slot))
 
 
-def kind_of_place(world: World, slot: IntArray, missing: IntArray) -> IntArray:
-    """Whether new flowers (k,) stand alone, or beside a known cluster, which may move, or be ``missing`` (c,) some."""
+def kind_of_place(world: World, slot: IntArray, missing: IntArray, beside: BoolArray) -> IntArray:
+    """Whether new flowers (k,) stand alone, or beside a known cluster, which may move, or be ``missing`` (c,) some.
+
+    ``beside`` (k,): beside one that moves, in a cluster of their own.
+    """
     known = np.array([cluster.state != "tentative" for cluster in world.clusters])
     misses = np.zeros(len(known), dtype=np.int64)
     misses[: len(missing)] = missing
-    moves = np.array([cluster.is_moving for cluster in world.clusters])
-    is_doubtful = moves | (misses >= np.bincount(slot, minlength=len(known)))
+    is_doubtful = misses >= np.bincount(slot, minlength=len(known))
     place: IntArray = np.where(known[slot], np.where(is_doubtful[slot], DOUBTFUL, BESIDE), ALONE)
-    return place
+    return np.where(beside, DOUBTFUL, place)
 
 
 def is_fresh(world: World, w: Array) -> BoolArray:
@@ -76,21 +78,30 @@ def note_spacing(world: World, w: Array) -> None:
     world.spacing = low if not np.isfinite(world.spacing) else world.spacing + 0.05 * (low - world.spacing)
 
 
-def slots_for(world: World, w: Array, left: IntArray, known: IntArray, row_of: IntArray, stamp: float) -> IntArray:
-    """Clusters (k,) for new flowers at ``w[left]``; new clusters are made where none is near."""
+def slots_for(
+    world: World, w: Array, left: IntArray, known: IntArray, row_of: IntArray, stamp: float
+) -> tuple[IntArray, BoolArray]:
+    """Clusters (k,) for new flowers at ``w[left]``, and which of these stand beside one that moves.
+
+    New clusters are made where none is near, or where it moves: who hangs beside a cluster that swings need not swing
+    with it, and who does is found by the grouping.
+    """
     table, link = world.flowers, world.grouping.link
-    slot = np.full(len(left), -1, dtype=np.int64)
+    host = np.full(len(left), -1, dtype=np.int64)
     if link > 0.0 and len(known):
         gap = np.linalg.norm(w[left][:, None] - w[known][None], axis=-1)
         near = gap.min(1) < link
-        slot[near] = table.slot[row_of[known[gap.argmin(1)]]][near]
+        host[near] = table.slot[row_of[known[gap.argmin(1)]]][near]
     if link > 0.0 and len(table):
         gap = np.linalg.norm(w[left][:, None] - table.place[None], axis=-1)
-        near = (slot < 0) & (gap.min(1) < link)
-        slot[near] = table.slot[gap.argmin(1)][near]
+        near = (host < 0) & (gap.min(1) < link)
+        host[near] = table.slot[gap.argmin(1)][near]
+    moves = np.array([cluster.is_moving for cluster in world.clusters] + [False])
+    beside: BoolArray = moves[host]
+    slot = np.where(beside, -1, host)
     free = np.flatnonzero(slot < 0)
     if len(free):
         label = world.grouping.group_new(w[left[free]], world.view_volume())
         for k in range(int(label.max()) + 1):
             slot[free[label == k]] = world.new_cluster(stamp)
-    return slot
+    return slot, beside

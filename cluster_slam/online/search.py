@@ -147,12 +147,17 @@ def _refined(
         if len(rows) < 2:
             return _NOTHING
         total = W[cols].sum(0)
-        d = np.linalg.solve(total, (W[cols] @ (points[cols] - places[rows])[..., None])[..., 0].sum(0))
-    residual = points[cols] - places[rows] - d
-    chi2 = np.einsum("qi,qij,qj->q", residual, W[cols], residual)
-    log_prior = float(prior(d[None])[0])
-    score = np.maximum(config.match_gain - 0.5 * chi2, 0.0).sum() - (len(places) - len(rows)) + log_prior
-    return Moved(float(score), mine[rows], pool[cols], chi2, d, prior.is_jump(d))
+        pull = (W[cols] @ (points[cols] - places[rows])[..., None])[..., 0].sum(0)
+        d = np.linalg.solve(total, pull)
+    # The noise of so few points looks like a small jump: as predicted is the other explanation of the same matches.
+    as_predicted = np.linalg.solve(total + prior.information, pull + prior.information @ prior.predicted)
+    tried = []
+    for shift, log_prior in ((d, prior.jump(d)), (as_predicted, prior.stay(as_predicted))):
+        residual = points[cols] - places[rows] - shift
+        chi2 = np.einsum("qi,qij,qj->q", residual, W[cols], residual)
+        score = np.maximum(config.match_gain - 0.5 * chi2, 0.0).sum() - (len(places) - len(rows)) + float(log_prior)
+        tried.append(Moved(float(score), mine[rows], pool[cols], chi2, shift, is_jump=not tried))
+    return max(tried, key=lambda m: m.score)
 
 
 class _JumpPrior:
@@ -162,18 +167,18 @@ class _JumpPrior:
         self.predicted, self.jump_sigma = predicted, jump_sigma
         self.information = information(P + 1e-12 * np.eye(3))
 
-    def _chi2(self, d: Array) -> Array:
+    def stay(self, d: Array) -> Array:
+        """As the filter predicts."""
         step = d - self.predicted
-        return np.asarray(((step @ self.information) * step).sum(-1))
+        return np.asarray(-0.5 * ((step @ self.information) * step).sum(-1))
+
+    def jump(self, d: Array) -> Array:
+        """After a touch."""
+        step = d - self.predicted
+        return np.asarray(_UNLIKELY_JUMP - 0.5 * (step * step).sum(-1) / self.jump_sigma**2)
 
     def __call__(self, d: Array) -> Array:
-        step = d - self.predicted
-        jump = _UNLIKELY_JUMP - 0.5 * (step * step).sum(-1) / self.jump_sigma**2
-        return np.asarray(np.maximum(-0.5 * self._chi2(d), jump))
-
-    def is_jump(self, d: Array) -> bool:
-        """Whether no filter would have predicted this."""
-        return bool(-0.5 * self._chi2(d) < _UNLIKELY_JUMP)
+        return np.maximum(self.stay(d), self.jump(d))
 
 
 def _gains(d: Array, places: Array, points: Array, W: Array, match_gain: float) -> Array:

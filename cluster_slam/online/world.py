@@ -17,6 +17,8 @@ from cluster_slam.online.records import Revision, RevisionKind, Subject
 from cluster_slam.records import BoolArray, IntArray
 from tracking.motion import MotionConfig
 
+_UNCLAIMED_GAIN = 0.02  # of a frame, in the mean number of points that nobody claims
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
@@ -48,6 +50,7 @@ class World:
         self.births = Births()
         self.usual_dt = 1.0 / 30.0
         self.x = np.zeros(6)  # hand-eye tangent
+        self.unclaimed = 1.0  # points a frame that no known flower claims, averaged
         self._next_cluster = 0
 
     def new_cluster(self, stamp: float) -> int:
@@ -114,6 +117,14 @@ class World:
         depth = 0.5 * (self.low[2] + self.high[2])
         width, height = np.maximum(self.high - self.low, 0.1)[:2] * depth
         return float(width * height * depth)
+
+    def note_unclaimed(self, n: int) -> None:
+        """So many points of a frame belong to no known flower."""
+        self.unclaimed += _UNCLAIMED_GAIN * (n - self.unclaimed)
+
+    def unclaimed_density(self) -> float:
+        """Points in one look that belong to no known flower, 1 / m^3."""
+        return max(self.unclaimed, _UNCLAIMED_GAIN) / self.view_volume()
 
     def place_anchors(self, slots: IntArray) -> None:
         """Centroids at rest of these clusters, from their flowers: the confirmed ones, where there are any."""
