@@ -151,7 +151,7 @@ def _refined(
         d = np.linalg.solve(total, pull)
     # The noise of so few points looks like a small jump: as predicted is the other explanation of the same matches.
     as_predicted = np.linalg.solve(total + prior.information, pull + prior.information @ prior.predicted)
-    tried = []
+    tried: list[Moved] = []
     for shift, log_prior in ((d, prior.jump(d)), (as_predicted, prior.stay(as_predicted))):
         residual = points[cols] - places[rows] - shift
         chi2 = np.einsum("qi,qij,qj->q", residual, W[cols], residual)
