@@ -16,7 +16,8 @@ from cluster_slam.constellation.identify import Identities
 from cluster_slam.io.map import open_map
 from cluster_slam.pipeline.remember import add
 from cluster_slam.remember.gauge import frame_covariance
-from cluster_slam.remember.predict import learned_seen_share, membership_cov
+from cluster_slam.remember.predict import membership_cov
+from cluster_slam.remember.seen import learned_seen_share
 from cluster_slam.remember.tables import aligned
 from cluster_slam.remember.update import update
 from cluster_slam.simulate.config import SimulateConfig
@@ -64,14 +65,14 @@ def test_the_share_of_flowers_that_are_seen_is_learned(tmp_path: Path) -> None:
     config = replace(SEASON, session=SimulateConfig(n_clusters=12))
     plant = SeasonPlant(config, seed=3)
     with map_of(tmp_path, plant) as store:
-        assert learned_seen_share(store.plant("row3"), 0.85) == 0.85
+        assert learned_seen_share(store.plant("row3"), MapConfig()) == (0.85, 10.0)
     hidden = SeasonPlant(replace(config, unseen_share=0.5), seed=3)
     hidden.grow_to(0.0)
     second = rest_incoming(hidden).constellation
     second = replace(second, session="second", start=second.start + DAY_S, end=second.end + DAY_S)
     with open_map(tmp_path / "row3.map") as store:
         assert add(store, replace(rest_incoming(plant), constellation=second)).session is not None
-        assert 0.45 < learned_seen_share(store.plant("row3"), 0.85) < 0.75
+        assert 0.45 < learned_seen_share(store.plant("row3"), MapConfig())[0] < 0.75
 
 
 def test_the_frame_is_as_sure_as_the_mean_drift(tmp_path: Path) -> None:

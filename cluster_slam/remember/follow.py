@@ -16,7 +16,7 @@ from cluster_slam.remember.tables import CLUSTER, FLOWER, Aligned
 from tracking.presence import after_group_miss, after_miss, persisted
 
 PRIOR_CLUSTERS = 4.0  # the priors of drift and walk count as so many clusters
-N_ROUNDS = 8  # of expectation maximisation
+N_ROUNDS = 40  # of expectation maximisation
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,60 +7,37 @@ from dataclasses import replace
 import numpy as np
 
 from cluster_slam.config import MapConfig
-from cluster_slam.constellation.growth import DAY_S, at, gaps
+from cluster_slam.constellation.growth import DAY_S, at
 from cluster_slam.geometry import Array
 from cluster_slam.records import IntArray, PlantMap
+from cluster_slam.remember.hold import Seen, holding
+from cluster_slam.remember.seen import habits_of, is_real, unknown_flowers
 from tracking.presence import persisted
 
-PRIOR_LOOKS = 10.0  # the prior share of flowers that a session sees counts as so many looks
 PRIOR_SPREAD = 2.0  # the plant's mean spread of flowers counts as so many flowers of each cluster
 N_NODES = 24
 
 
 def predict_plant(plant: PlantMap, time: float, config: MapConfig) -> tuple[PlantMap, Array]:
-    """The plant at a time, and the covariances (c, 3, 3) of the centroids of the flowers that will be seen there.
+    """The plant at a time, and covariances (c, 3, 3): 95 % ellipsoids hold the centroid of what will be seen in 95 %.
 
     A cluster's centroid moves with the cluster, and because other flowers make it up: some are lost, some are hidden
     that day, some open, some were there all the time and nobody saw them.
     """
     moved = at(plant, time, config.growth)
     row, n = moved.flower_rows, len(moved.cluster_ids)
-    seen_share = learned_seen_share(plant, config.match.seen_share)
+    habits = habits_of(plant, config)
     since = np.maximum(np.nan_to_num(time - plant.flower_last_looked_at) / DAY_S, 0.0)
-    share = seen_share * persisted(moved.flower_presence, config.growth.lost_per_day, since)
-    share = share * _is_real(plant, config.match.ghosts)
+    share = habits.share * persisted(moved.flower_presence, config.growth.lost_per_day, since)
+    share = share * is_real(plant, config.match.ghosts)
     weight = np.maximum(np.bincount(row, share, n), 1e-12)
     centres = np.stack([np.bincount(row, share * x, n) for x in moved.flowers.T], axis=1) / weight[:, None]
     offsets = moved.flowers - centres[row]
-    unknown = _unknown(plant, weight, seen_share, time, config)
-    covs: Array = moved.cluster_covs + _sum(row, n, (share / weight[row]) ** 2, moved.flower_covs)
-    covs = covs + membership_cov(offsets, share, row, unknown, _spread(offsets, row, n))
-    return replace(moved, clusters=centres), covs
-
-
-def learned_seen_share(plant: PlantMap, prior: float) -> float:
-    """Share of the flowers that a session sees, from those whose cluster was seen at least twice."""
-    row = plant.flower_rows
-    again = plant.flower_first_seen < plant.cluster_last_seen[row]
-    hits = float((again & (plant.flower_last_seen == plant.cluster_last_seen[row])).sum())
-    misses = float(plant.flower_presence[again & (plant.flower_last_seen < plant.cluster_last_seen[row])].sum())
-    return min((PRIOR_LOOKS * prior + hits) / (PRIOR_LOOKS + hits + misses), 0.999)
-
-
-def _is_real(plant: PlantMap, ghosts: float) -> Array:
-    """Probability (f,) that a flower is one: of those seen once, so many beside each cluster are false."""
-    once = plant.flower_first_seen == plant.flower_last_seen
-    n = np.bincount(plant.flower_rows, minlength=len(plant.cluster_ids))[plant.flower_rows]
-    return np.where(once, n / (n + ghosts), 1.0)
-
-
-def _unknown(plant: PlantMap, seen: Array, seen_share: float, time: float, config: MapConfig) -> Array:
-    """Mean number (c,) of flowers beside a cluster's known ones that will be seen: hidden so far, new, or false."""
-    looks = 1.0 + (plant.cluster_last_seen > plant.cluster_first_seen)
-    hidden = (1.0 - seen_share) ** looks
-    days = np.abs(gaps(plant, time)) / DAY_S
-    unknown: Array = seen * (hidden / (1.0 - hidden) + config.growth.new_per_day * days)
-    return unknown + config.match.ghosts
+    unknown, spread = unknown_flowers(plant, weight, habits, time, config), _spread(offsets, row, n)
+    smooth: Array = moved.cluster_covs + _sum(row, n, (share / weight[row]) ** 2, moved.flower_covs)
+    covs = smooth + membership_cov(offsets, share, row, unknown, spread)
+    seen = Seen(offsets, share, row, unknown, spread)
+    return replace(moved, clusters=centres), holding(covs, smooth, seen, habits)
 
 
 def _spread(offsets: Array, row: IntArray, n: int) -> Array:

@@ -1,0 +1,92 @@
+"""How much of a plant a session sees, learned from what came back, what did not, and what nobody knew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cluster_slam.config import MapConfig
+from cluster_slam.constellation.growth import DAY_S, gaps
+from cluster_slam.geometry import Array
+from cluster_slam.records import PlantMap
+from tracking.presence import persisted
+
+PRIOR_LOOKS = 10.0  # the prior share of flowers that a session sees counts as so many looks
+PRIOR_SURPRISES = 5.0  # flowers that nobody knew: what is expected of them counts as so many
+N_ROUNDS = 12  # of expectation maximisation
+SHAPES = (1.0, 50.0)  # of the gamma distribution of clusters' sizes: from any size to all alike
+
+
+@dataclass(frozen=True, slots=True)
+class Habits:
+    """What sessions of a plant see, and what that is known from."""
+
+    share: float  # of the flowers that are there
+    looks: float  # flowers, prior ones too, that tell the share
+    surprise: float  # times as many flowers as expected nobody knew
+    surprises: float  # flowers, prior ones too, that tell that
+
+
+def habits_of(plant: PlantMap, config: MapConfig) -> Habits:
+    """What a session of the plant sees, as far as is known."""
+    share, looks = learned_seen_share(plant, config)
+    return Habits(share, looks, *_surprise(plant, share, config))
+
+
+def learned_seen_share(plant: PlantMap, config: MapConfig) -> tuple[float, float]:
+    """Share of the flowers that a session sees, and how many flowers tell: whose cluster was seen at least twice.
+
+    One that did not come back was hidden, or lost, or false from the beginning (expectation maximisation).
+    """
+    row, share = plant.flower_rows, config.match.seen_share
+    again = plant.flower_first_seen < plant.cluster_last_seen[row]
+    missed = again & (plant.flower_last_seen < plant.cluster_last_seen[row])
+    hits = float((again & ~missed).sum())
+    days = np.nan_to_num(plant.cluster_last_seen[row] - plant.flower_last_seen)[missed] / DAY_S
+    there = persisted(is_real(plant, config.match.ghosts)[missed], config.growth.lost_per_day, days)
+    prior, hidden = share, 0.0
+    for _ in range(N_ROUNDS):
+        hidden = float((there * (1.0 - share) / (1.0 - there * share)).sum())
+        share = min((PRIOR_LOOKS * prior + hits) / (PRIOR_LOOKS + hits + hidden), 0.999)
+    return share, PRIOR_LOOKS + hits + hidden
+
+
+def is_real(plant: PlantMap, ghosts: float) -> Array:
+    """Probability (f,) that a flower is one: of those seen once, so many beside each cluster are false."""
+    once = plant.flower_first_seen == plant.flower_last_seen
+    n = np.bincount(plant.flower_rows, minlength=len(plant.cluster_ids))[plant.flower_rows]
+    return np.where(once, n / (n + ghosts), 1.0)
+
+
+def unknown_flowers(plant: PlantMap, seen: Array, habits: Habits, time: float, config: MapConfig) -> Array:
+    """Mean number (c,) of flowers beside a cluster's known ones that will be seen: hidden so far, new, or false.
+
+    ``seen`` (c,) of the known ones will be. A cluster of few known flowers has more hidden ones than its share: sizes
+    are Poisson of a rate that is gamma distributed over the plant, shape r and mean m by their moments, so that with k
+    seen of a part 1 - h that shows, h (k + r) / (1 - h + r / m) are hidden.
+    """
+    looks = 1.0 + (plant.cluster_last_seen > plant.cluster_first_seen)
+    h = (1.0 - habits.share) ** looks
+    sizes = seen / np.maximum(habits.share * (1.0 - h), 1e-3)
+    mean = max(float(sizes.mean()), 1e-3)
+    shape = float(np.clip(mean**2 / max(float(sizes.var()) - mean, 1e-3), *SHAPES))
+    hidden = h * (seen + habits.share * shape) / (1.0 - h + shape / mean)
+    days = np.abs(gaps(plant, time)) / DAY_S
+    unknown: Array = hidden + seen * config.growth.new_per_day * days + config.match.ghosts
+    return unknown * habits.surprise
+
+
+def _surprise(plant: PlantMap, seen_share: float, config: MapConfig) -> tuple[float, float]:
+    """How many times more flowers than expected nobody knew when their clusters were last seen, and how many tell."""
+    row, last = plant.flower_rows, plant.cluster_last_seen
+    sessions = np.unique(plant.flower_first_seen)
+    before = sessions[np.maximum(np.searchsorted(sessions, last) - 1, 0)] if len(sessions) else last
+    again = plant.cluster_first_seen < last
+    is_new = plant.flower_first_seen == last[row]
+    n_before = np.bincount(row, ~is_new * plant.flower_presence, len(last))
+    found = float(is_new[again[row]].sum())
+    days = np.nan_to_num(last - np.maximum(before, plant.cluster_first_seen)) / DAY_S
+    expected = n_before * (1.0 - seen_share + config.growth.new_per_day * days) + config.match.ghosts
+    surprise = (PRIOR_SURPRISES + found) / (PRIOR_SURPRISES + float(expected[again].sum()))
+    return surprise, PRIOR_SURPRISES + found
