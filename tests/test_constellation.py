@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from map_help import SMALL
 
 from cluster_slam.config import GrowthConfig, MapConfig
-from cluster_slam.constellation.fit import Pairs, fit, pose_covariance
+from cluster_slam.constellation.fit import Pairs, fit, pose_covariance, variance_factors
 from cluster_slam.constellation.growth import DAY_S, at
 from cluster_slam.constellation.identify import nobody
 from cluster_slam.constellation.match import match
@@ -91,6 +91,18 @@ def test_the_covariance_of_the_pose_is_true() -> None:
         error = se3_log(inverse(T) @ found)
         squared.append(error @ np.linalg.solve(pose_covariance(pairs, 1.0, with_scale=False), error))
     assert abs(np.mean(squared) - 6.0) < 4 * np.sqrt(2 * 6 / 300)
+
+
+def test_residuals_say_what_the_variances_are() -> None:
+    """Errors within clusters twice, drift half as large as said: factors of 4 and 1/4, within a few of their sigmas."""
+    rng = np.random.default_rng(6)
+    unit = np.repeat(np.arange(40), 4)
+    a = rng.normal(0.0, 0.3, (40, 3))[unit] + rng.normal(0.0, 0.03, (160, 3))
+    b = a + rng.normal(0.0, 0.005, (40, 3))[unit] + rng.normal(0.0, 0.002, (160, 3))
+    pairs = Pairs(a, b, np.full(160, 0.001**2), unit, np.full(40, 0.01**2))
+    within, between = variance_factors(pairs, fit(pairs, (1.0, 1.0)))
+    assert abs(within / 4.0 - 1.0) < 4 * np.sqrt(2 / 360) + 12 / 372
+    assert abs(np.log2(between / 0.25)) < 4 * np.sqrt(2 / 114) / np.log(2)
 
 
 def test_a_plant_at_another_time() -> None:

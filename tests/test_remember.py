@@ -16,8 +16,9 @@ from cluster_slam.constellation.identify import Identities
 from cluster_slam.io.map import open_map
 from cluster_slam.pipeline.remember import add
 from cluster_slam.remember.gauge import frame_covariance
+from cluster_slam.remember.hold import Seen, holding
 from cluster_slam.remember.predict import membership_cov
-from cluster_slam.remember.seen import learned_seen_share
+from cluster_slam.remember.seen import Habits, learned_seen_share
 from cluster_slam.remember.tables import aligned
 from cluster_slam.remember.update import update
 from cluster_slam.simulate.config import SimulateConfig
@@ -58,6 +59,24 @@ def test_an_unknown_flower_beside_one() -> None:
     poisson = np.exp(-0.3) * 0.3**m / np.cumprod(np.maximum(m, 1))
     found = membership_cov(np.zeros((1, 3)), np.ones(1), np.zeros(1, int), np.array([0.3]), np.ones(1))
     np.testing.assert_allclose(found[0], float(poisson @ (m / (1.0 + m) ** 2)) * np.eye(3), rtol=1e-4)
+
+
+def test_ellipsoids_hold_what_a_gaussian_would_not() -> None:
+    """Jumps in a tenth of the draws: the 95 % ellipsoid reaches their middle, one in fifty is left out, none counts."""
+    n = 4
+    smooth = np.tile(1e-6 * np.eye(3), (n, 1, 1))
+    unknown, spread = np.array([-np.log(0.9), -np.log(0.98), 0.0, 0.0]), np.full(n, 0.02**2)
+    offsets = np.array([[0.0, 0.0, 0.0]] * 3 + [[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0]])
+    seen = Seen(offsets, np.array([1.0, 1.0, 1.0, 0.5, 0.5]), np.array([0, 1, 2, 3, 3]), unknown, spread)
+    sure = Habits(0.9999, 1e9, 1.0, 1e9)
+    covs = smooth + membership_cov(offsets, seen.share, seen.row, unknown, spread)
+    held = holding(covs, smooth, seen, sure)
+    radius = np.sqrt(7.815 * np.array([np.diag(c).min() for c in held]))
+    # one more flower puts the centroid at half of its offset, 0.01 an axis: its norm is beyond 1.54 sigma in a half
+    assert 0.011 < radius[0] < 0.020
+    assert radius[1] < 0.004
+    np.testing.assert_allclose(radius[2], 0.0028, rtol=0.1)
+    assert np.sqrt(7.815 * held[3][0, 0]) > 0.03  # either of two is seen in two thirds
 
 
 def test_the_share_of_flowers_that_are_seen_is_learned(tmp_path: Path) -> None:

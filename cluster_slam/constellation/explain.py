@@ -122,7 +122,7 @@ def refine(scene: Scene, found: Explained, n_rounds: int = 4) -> Explained:
     for _ in range(n_rounds):
         if n_flowers(best) < scene.query.centres.shape[1]:
             break
-        pose = fit(_robust(matched_pairs(scene, best), best.pose), scene.scale_range)
+        pose = fit(robust(matched_pairs(scene, best), best.pose), scene.scale_range)
         again = explain(scene, pose)[0]
         if again.log_ratio <= best.log_ratio + 1e-6:
             if again.log_ratio > best.log_ratio:
@@ -132,7 +132,7 @@ def refine(scene: Scene, found: Explained, n_rounds: int = 4) -> Explained:
     return best
 
 
-def _robust(pairs: Pairs, pose: Similarities) -> Pairs:
+def robust(pairs: Pairs, pose: Similarities) -> Pairs:
     """Units that moved much farther than expected count less: their own drift was larger (Student's t, 4 dof)."""
     if pairs.n_units < 4:
         return pairs

@@ -10,6 +10,8 @@ from cluster_slam.constellation.similarity import Similarities, from_moments
 from cluster_slam.geometry import Array, skew
 from cluster_slam.records import IntArray
 
+PRIOR_DOF = 12.0  # what is said beforehand of variances within units counts as so many degrees of freedom
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
@@ -47,6 +49,28 @@ def _centred(pairs: Pairs) -> _Centred:
         means.append(sums / total[:, None])
     between = 1.0 / (pairs.var_offset + 1.0 / total)
     return _Centred(means[0], means[1], between, weight, pairs.a - means[0][pairs.unit], pairs.b - means[1][pairs.unit])
+
+
+def variance_factors(pairs: Pairs, pose: Similarities) -> tuple[float, float]:
+    """By how much the residuals say the variances are wrong: of flowers in their units, and of the units' offsets.
+
+    Within units a sum of squares over its degrees of freedom; between them the mean over a grid of factors of the
+    restricted likelihood (6 of 3 u degrees of freedom went into the pose), a factor of two being one sigma beforehand.
+    """
+    c = _centred(pairs)
+    d = pairs.a.shape[1]
+    moved = pose.apply(c.mean_a)[0]
+    inner = float(pose.scale[0]) * c.da @ pose.R[0].T - c.db
+    dof = float((len(pairs.a) - pairs.n_units) * d)
+    within = (PRIOR_DOF + float(c.within @ (inner**2).sum(axis=1))) / (PRIOR_DOF + dof)
+    own = within / np.bincount(pairs.unit, c.within, pairs.n_units)
+    left = max(d * pairs.n_units - d * (d + 1) / 2, 1.0) / pairs.n_units
+    squared = ((moved - c.mean_b) ** 2).sum(axis=1) * d / left
+    factors = np.exp2(np.linspace(-4.0, 4.0, 65))
+    total = factors[:, None] * pairs.var_offset + own
+    log_density = -0.5 * left * (np.log(total) + squared / d / total).sum(axis=1) - 0.5 * np.log2(factors) ** 2
+    weight = np.exp(log_density - log_density.max())
+    return within, float(weight @ factors / weight.sum())
 
 
 def fit(pairs: Pairs, scale_range: tuple[float, float]) -> Similarities:

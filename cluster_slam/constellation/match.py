@@ -8,13 +8,13 @@ import numpy as np
 
 from cluster_slam.config import GrowthConfig, MatchConfig
 from cluster_slam.constellation.evidence import evidence_of, is_too_few
-from cluster_slam.constellation.explain import Explained, Scene, explain, matched_pairs, n_flowers, refine
-from cluster_slam.constellation.fit import Pairs
+from cluster_slam.constellation.explain import Explained, Scene, explain, matched_pairs, n_flowers, refine, robust
+from cluster_slam.constellation.fit import Pairs, fit, variance_factors
 from cluster_slam.constellation.growth import DAY_S
 from cluster_slam.constellation.plane import Space, spaces
 from cluster_slam.constellation.poses import Places, best_distinct, guess_poses, quick_scores
-from cluster_slam.constellation.similarity import concatenate
-from cluster_slam.constellation.units import Units, background_of, plant_units, session_units
+from cluster_slam.constellation.similarity import Similarities, concatenate
+from cluster_slam.constellation.units import MATCH_FLOOR_M, Units, background_of, plant_units, session_units
 from cluster_slam.constellation.warp import warped
 from cluster_slam.geometry import Array
 from cluster_slam.records import Constellation, PlantMap
@@ -41,6 +41,7 @@ class Found:
     scene: Scene
     best: Explained
     single: bool  # flowers one by one, not cluster by cluster
+    offset_factor: float  # variance of the units' drift over what was expected, by this session's residuals
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -245,10 +246,22 @@ def _found(session: Constellation, alive: PlantMap, best: _Candidate) -> Found |
         scene, found = _with_prior(scene, found)
     if is_too_few(found, best.space.d, single=best.single):
         return None
-    pose, scale = found.pose, float(found.pose.scale[0])
     row, member = np.nonzero(found.partner >= 0)
     a = session.flowers[scene.query.flower[found.query[row], member]]
-    pairs = replace(matched_pairs(scene, found), a=a, b=a)
-    return Found(
-        alive, best.space.to_map(pose.R[0], pose.t[0], scale), scale, pairs, best.space, scene, found, best.single
-    )
+    pairs, factor = _as_measured(matched_pairs(scene, found), found.pose)
+    pose = fit(pairs, scene.scale_range)
+    scale = float(pose.scale[0])
+    T, pairs = best.space.to_map(pose.R[0], pose.t[0], scale), replace(pairs, a=a, b=a)
+    return Found(alive, T, scale, pairs, best.space, scene, found, best.single, factor)
+
+
+def _as_measured(pairs: Pairs, pose: Similarities) -> tuple[Pairs, float]:
+    """Pairs with variances as their residuals have them, and the factor of the units' drift.
+
+    The floor that makes matching patient is no error of the pose.
+    """
+    floor = MATCH_FLOOR_M**2
+    variance, offset = np.maximum(pairs.variance - floor, 1e-9), np.maximum(pairs.var_offset - floor, 1e-9)
+    pairs = replace(pairs, variance=variance, var_offset=offset)
+    within, between = variance_factors(pairs, pose)
+    return robust(replace(pairs, variance=within * variance, var_offset=between * offset), pose), between

@@ -147,7 +147,10 @@ def _known(store: MapStore, incoming: Incoming, found: Found, decision: Decision
     now, sessions = incoming.constellation.start, store.sessions(plant.name)
     low, high = found.scene.scale_range
     memory = config.growth.memory_days
-    cov = frame_covariance(found.pairs, found.scale, plant, sessions, now, memory, with_scale=low < high)
+    factor, with_scale = found.offset_factor, low < high
+    cov = frame_covariance(
+        found.pairs, found.scale, plant, sessions, now, memory, drift_factor=factor, with_scale=with_scale
+    )
     return _entry(store, incoming, plant, T, found.scale, cov, who, evidence, decision.probability, config)
 
 

@@ -30,6 +30,7 @@ def frame_covariance(
     now: float,
     memory_days: float,
     *,
+    drift_factor: float = 1.0,
     with_scale: bool,
 ) -> Array:
     """Covariance (6, 6) of T_map_world, of the tangent on the right, to the frame of the plant's first session.
@@ -42,10 +43,13 @@ def frame_covariance(
         The plant's, in the order in which they came; the first made its frame.
     now
         s, of the session that was aligned.
+    drift_factor
+        Variance of the drift over what was expected, as this session has it: while nothing else has been learned of it.
     """
     begin = sessions[0].start
     since = _drifted(plant, now - begin, memory_days)
     first_gap = since if len(sessions) < 2 else _drifted(plant, sessions[1].start - begin, memory_days)
+    since *= drift_factor if len(sessions) < 2 else 1.0
     grown = max(since / first_gap, 1.0) if first_gap > 0.0 else 1.0
     common = since * min(pairs.n_units / max(int((plant.cluster_presence > 0.5).sum()), 1), 1.0)
     pairs = replace(pairs, var_offset=np.maximum(pairs.var_offset, common), variance=pairs.variance * grown)
