@@ -26,7 +26,8 @@ from cluster_slam.graph.noise import camera_covs
 from cluster_slam.graph.variance import errs_slowly
 from cluster_slam.grouping import Motion, group_flowers
 from cluster_slam.records import BoolArray
-from cluster_slam.smoothing.stretches import quarter_period, rest_sigma, standing_still, stretches
+from cluster_slam.smoothing.displaced import Displaced, share_left
+from cluster_slam.smoothing.stretches import at_rest, standing_still, stretches
 from cluster_slam.smoothing.world import NO_WEIGHT, World, fewest_observations, scalar_var
 from tracking.gating import chi2_threshold
 
@@ -98,12 +99,14 @@ def problem(
     alone = np.bincount(world.cluster, minlength=1).max(initial=0) < 2
     if alone:
         scale = np.zeros_like(scale)  # flowers that stand alone tell no sway from errors of their own
-    rest = standing_still(cov) if alone else rest_sigma(d, cov, scale, frame, cluster, frames.stamps)
+    camera, _ = camera_covs(model, world.X)
+    share = share_left(frames, world.T, of, frame, cov, camera)
+    moved = Displaced(d, cov, share, scale, frame, cluster, frames.stamps)
+    rest, lasting_s = (standing_still(cov), 0.0) if alone else at_rest(moved)
     sigma = np.hypot(scale, rest)
     stretch, stretch_sigma = np.full(len(frame), -1), np.empty(0)
-    if in_stretches and not alone:
-        length = quarter_period(d, scale, frame, cluster, frames.stamps)
-        stretch, stretch_sigma, sigma = stretches(d, cov, sigma, frame, cluster, frames.stamps, length)
+    if in_stretches and not alone and len(frame):
+        stretch, stretch_sigma, sigma = stretches(moved, rest, lasting_s)
     pairs = Pairs(of=of, frame=frame, cluster=cluster, sigma=sigma, stretch=stretch, stretch_sigma=stretch_sigma)
     start = Estimate(
         T=world.T,

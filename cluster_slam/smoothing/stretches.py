@@ -3,6 +3,9 @@
 A cluster that swings passes through the same side of its rest for a quarter of its period. Displacements within such a
 stretch share a mean of their own; from stretch to stretch they are independent. So a cluster that was seen for a moment
 while it swayed has a rest place that is as uncertain as the sway is wide, however many frames saw it.
+
+A cluster that is not known to move moves a little all the same, and slowly: a few tenths of a millimetre that last for
+half a second are ten times the error of that many measurements. Its stretches are as long as what it does at rest.
 """
 
 from __future__ import annotations
@@ -11,45 +14,14 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from cluster_slam.geometry import Array
-from cluster_slam.records import IntArray
+from cluster_slam.records import BoolArray, IntArray
+from cluster_slam.smoothing.displaced import FEWEST, Displaced, Series
 
 _LAGS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 21, 26, 34, 42, 55, 68, 89, 110, 144)
 _WITHIN = 0.5  # of a stretch's sigma: how far a displacement strays from the stretch's mean, a quarter of a sine
-_FEWEST = 30  # products that make a covariance
 _CALM_SHARE = 0.1  # of the measurement's sigma: no cluster is known to stand stiller
-
-
-class Series:
-    """Measured displacements as series (n, c, 3), zero where unseen."""
-
-    def __init__(self, d: Array, frame: IntArray, cluster: IntArray, stamps: Array) -> None:
-        """Displacements d (p, 3) of clusters (p,) in frames (p,) at ``stamps`` (n,)."""
-        n_clusters = int(cluster.max(initial=0)) + 1
-        self.stamps = stamps
-        self.dt = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
-        self.values = np.zeros((len(stamps), n_clusters, 3))
-        self.seen = np.zeros((len(stamps), n_clusters))
-        self.values[frame, cluster] = d
-        self.seen[frame, cluster] = 1.0
-
-    def own_covariance(self, lag: int) -> tuple[float, float]:
-        """The same without what all clusters have in common: that is an error of the pose, or of the mounting."""
-        value, count = self.covariance(lag)
-        if lag >= len(self.values):
-            return value, count
-        early, late = self.values[:-lag], self.values[lag:]
-        seen_early, seen_late = self.seen[:-lag], self.seen[lag:]
-        n_both = float((seen_early.sum(axis=1) * seen_late.sum(axis=1)).sum()) - count
-        both = float((early.sum(axis=1) * late.sum(axis=1)).sum()) - 3.0 * count * value
-        common = both / (3.0 * n_both) if n_both >= _FEWEST else value  # one cluster alone cannot tell
-        return value - max(common, 0.0), count
-
-    def covariance(self, lag: int) -> tuple[float, float]:
-        """Mean product along any axis of displacements ``lag`` frames apart, and how many products that is."""
-        if lag >= len(self.values):
-            return 0.0, 0.0
-        count = float((self.seen[lag:] * self.seen[:-lag]).sum())
-        return float((self.values[lag:] * self.values[:-lag]).sum()) / max(3.0 * count, 1.0), count
+_MISTAKE_CHI2 = 16.0  # of a displacement at rest beyond which it is taken for a mistake
+_LOST = 0.1  # correlation that is none any more
 
 
 def standing_still(cov: Array) -> float:
@@ -57,67 +29,101 @@ def standing_still(cov: Array) -> float:
     return _CALM_SHARE * float(np.sqrt(np.median(np.trace(cov, axis1=1, axis2=2)) / 3.0)) if len(cov) else 1e-4
 
 
-def rest_sigma(d: Array, cov: Array, scale: Array, frame: IntArray, cluster: IntArray, stamps: Array) -> float:
-    """How far clusters that are not known to move are from rest, m, one sigma along any axis.
+def at_rest(moved: Displaced) -> tuple[float, float]:
+    """How clusters move that are not known to move: one sigma along any axis, m, and for how long they err alike, s.
 
-    Noise of the measurements (p, 3, 3) is new in every frame, so what displacements of neighbouring frames have in
-    common is motion.
+    Noise of the measurements is new in every frame, so what displacements of neighbouring frames have in common is
+    motion. How long it lasts is the integral of its correlation over time.
     """
-    calm = scale <= 0.0
-    if not calm.any():
-        return standing_still(cov)
-    least = standing_still(cov[calm])
+    calm = moved.scale <= 0.0
+    least = standing_still(moved.cov[calm] if calm.any() else moved.cov)
     # Squares of rare mistakes would be all that is seen.
-    size = (d[calm] ** 2).sum(axis=1)
-    usual = np.flatnonzero(calm)[size <= 16.0 * np.trace(cov[calm], axis1=1, axis2=2)]
-    series = Series(d[usual], frame[usual], cluster[usual], stamps)
+    usual = calm & ((moved.d**2).sum(axis=1) <= _MISTAKE_CHI2 * 3.0 * moved.noise)
+    series = Series(moved, usual, 1.0 / moved.noise)
     (first, n_first), (second, n_second) = series.own_covariance(1), series.own_covariance(2)
-    if n_first + n_second < _FEWEST:
-        return least
+    if n_first + n_second < FEWEST:
+        return least, series.dt
     shared = (first * n_first + second * n_second) / (n_first + n_second)
-    return float(np.sqrt(max(shared, least**2)))
+    if shared <= least**2:
+        return least, series.dt
+    return float(np.sqrt(shared)), _lasting(series, shared)
 
 
-def quarter_period(d: Array, scale: Array, frame: IntArray, cluster: IntArray, stamps: Array) -> float:
+def _lasting(series: Series, square: float) -> float:
+    """Integral over time, s, of the correlation of displacements with mean ``square``, to the lag at which it is lost."""
+    total, last_lag, last = 1.0, 0, 1.0
+    for lag in _LAGS:
+        value, count = series.own_covariance(lag)
+        if count < FEWEST or value < _LOST * square:
+            break
+        now = min(value / square, last)
+        total += 2.0 * (now + (lag - last_lag - 1) * 0.5 * (now + last))
+        last_lag, last = lag, now
+    return total * series.dt
+
+
+def quarter_period(moved: Displaced) -> float:
     """Seconds after which a swaying cluster passes its rest: where the correlation of displacements is lost.
 
     With too little motion to tell, half a second.
     """
-    moving = scale > 0.0
-    series = Series(d[moving] / scale[moving, None], frame[moving], cluster[moving], stamps)
+    moving = moved.scale > 0.0
+    series = Series(moved, moving, 1.0 / np.where(moving, moved.scale, 1.0))
     first, count = series.covariance(1)
-    if count < _FEWEST or first <= 0.0:
+    if count < FEWEST or first <= 0.0:
         return 0.5
     for lag in _LAGS:
         value, count = series.covariance(lag)
-        if count < _FEWEST or value < 0.2 * first:
+        if count < FEWEST or value < 0.2 * first:
             return lag * series.dt
     return _LAGS[-1] * series.dt
 
 
-def stretches(
-    d: Array, cov: Array, sigma: Array, frame: IntArray, cluster: IntArray, stamps: Array, length_s: float
-) -> tuple[IntArray, Array, Array]:
+def stretches(moved: Displaced, rest: float, lasting_s: float) -> tuple[IntArray, Array, Array]:
     """Stretch 0..s-1 of each displacement (p,), sigma (s,) of each stretch's mean, and sigma (p,) about that mean.
 
-    ``sigma`` (p,) is how far each displacement d (p, 3) with noise (p, 3, 3) may be from rest. Where a cluster moves
-    on from one stretch to the next, it swings as widely as that speed says: (v / omega)^2 is the energy's other half.
+    At rest they are ``lasting_s`` long and as wide as ``rest`` m; while a cluster swings, a quarter of its period.
     """
-    if len(frame) == 0:
-        return np.empty(0, dtype=np.int64), np.empty(0), np.empty(0)
-    block = np.floor((stamps[frame] - stamps[0]) / length_s).astype(np.int64)
-    n_blocks = int(block.max()) + 1
-    key, of = np.unique(cluster * n_blocks + block, return_inverse=True)
-    count = np.bincount(of)
-    mean_square = np.bincount(of, sigma**2) / count
+    moving = moved.scale > 0.0
+    quarter_s = quarter_period(moved)
+    of, sigma = np.empty(len(moving), dtype=np.int64), np.full(len(moving), rest)
+    calm_keys, calm_of = np.unique(_block(moved, ~moving, lasting_s), return_inverse=True)
+    swing_keys, swing_of = np.unique(_block(moved, moving, quarter_s), return_inverse=True)
+    of[~moving], of[moving] = calm_of, len(calm_keys) + swing_of
+    wide = np.hypot(moved.scale[moving], rest)
+    swing = _swings(moved, moving, wide, swing_keys, swing_of, _n_blocks(moved, quarter_s))
+    sigma[moving] = np.maximum(wide, swing[swing_of])
+    return of, np.concatenate([np.full(len(calm_keys), rest), swing]), _WITHIN * sigma
+
+
+def _n_blocks(moved: Displaced, length_s: float) -> int:
+    return int((moved.stamps[-1] - moved.stamps[0]) / length_s) + 1
+
+
+def _block(moved: Displaced, which: BoolArray, length_s: float) -> IntArray:
+    """Number of the block of time of each of some displacements, cluster by cluster."""
+    block = np.floor((moved.stamps[moved.frame[which]] - moved.stamps[0]) / length_s).astype(np.int64)
+    numbers: IntArray = moved.cluster[which] * _n_blocks(moved, length_s) + block
+    return numbers
+
+
+def _swings(moved: Displaced, which: BoolArray, wide: Array, key: IntArray, of: IntArray, n_blocks: int) -> Array:
+    """Sigma (s,) of the mean of each stretch with block ``key`` (s,), from displacements ``wide`` m from rest.
+
+    Where a cluster moves on from one stretch to the next, it swings as widely as that speed says: (v / omega)^2 is the
+    energy's other half.
+    """
+    if len(key) == 0:
+        return np.empty(0)
+    d, count = moved.d[which], np.bincount(of)
+    mean_square = np.bincount(of, wide**2) / count
     mean = np.stack([np.bincount(of, d[:, a]) for a in range(3)], axis=-1) / count[:, None]
-    noise = np.bincount(of, np.trace(cov, axis1=1, axis2=2)) / count**2
+    noise = np.bincount(of, 3.0 * moved.noise[which]) / count**2
     follows = np.diff(key) == 1
     step = ((mean[1:] - mean[:-1]) ** 2).sum(axis=1) - 2.0 * (noise[1:] + noise[:-1])
     swing = np.where(follows, np.maximum(step, 0.0) * (2.0 / np.pi) ** 2 / 3.0, 0.0)
-    table = np.zeros((int(cluster.max()) + 1, n_blocks))
+    table = np.zeros((int(moved.cluster.max()) + 1, n_blocks))
     table.flat[key[1:]] = swing
     table.flat[key[:-1]] = np.maximum(table.flat[key[:-1]], swing)
     widest = maximum_filter1d(table, 3, axis=1).flat[key]
-    stretch_sigma = np.sqrt(np.maximum(mean_square, widest))
-    return of.astype(np.int64), stretch_sigma, _WITHIN * np.maximum(sigma, stretch_sigma[of])
+    return np.asarray(np.sqrt(np.maximum(mean_square, widest)))

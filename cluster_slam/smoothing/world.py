@@ -66,10 +66,23 @@ def learn(world: World, smoother: BatchSmoother, estimate: Estimate) -> World:
     found = variance_factors(smoother, estimate)
     if world.errs_slowly:
         found = VarianceFactors(1.0, 1.0, NO_WEIGHT)  # slow errors hide from residuals: the stated ones stay
-    noise = VarianceFactors(world.noise.flower * found.flower, world.noise.pose * found.pose, found.correlation)
+    noise = _combined(world, found, in_stretches=len(smoother.pairs.stretch_sigma) > 0)
     depth = np.full(smoother.m, np.nan)
     depth[smoother.rows] = smoother.residuals(estimate)[1][:, 2]
     return replace(world, T=estimate.T, X=estimate.X, places=estimate.places, noise=noise, depth=depth)
+
+
+def _combined(world: World, found: VarianceFactors, *, in_stretches: bool) -> VarianceFactors:
+    """Factors so far times those that were found, each where it can be found.
+
+    Redundancies are reckoned frame by frame, as if displacements were new in each: without stretches. What residuals
+    have in common over time is sway, unless stretches hold it or nothing sways.
+    """
+    if in_stretches:
+        return replace(world.noise, correlation=found.correlation)
+    sways = bool(np.bincount(world.cluster, minlength=1).max() > 1)
+    correlation = 1.0 if sways and not world.errs_slowly else found.correlation
+    return VarianceFactors(world.noise.flower * found.flower, world.noise.pose * found.pose, correlation)
 
 
 def with_unknown_scale(
