@@ -12,7 +12,7 @@ from cluster_slam.graph.variance import VarianceFactors
 from cluster_slam.records import Result, Session, Truth
 from cluster_slam.smoothing.finish import make_result
 from cluster_slam.smoothing.rounds import solve
-from cluster_slam.smoothing.world import World, for_solving, learn
+from cluster_slam.smoothing.world import World, for_solving, learn, say_how_sure
 
 
 def smooth_with_truth(session: Session, truth: Truth, config: SmoothConfig | None = None) -> Result:
@@ -38,6 +38,7 @@ def smooth_with_truth(session: Session, truth: Truth, config: SmoothConfig | Non
         frames, model = for_solving(stated, stated_poses, world)
         smoother, estimate = solve(frames, model, world, config, 6, in_stretches=in_stretches)
         world = learn(world, smoother, estimate)
+    say_how_sure(smoother, stated, stated_poses, world)
     marginals = smoother.marginals(estimate)
     return make_result(session, frames, world, smoother, estimate, marginals, config, 0, [], {})
 

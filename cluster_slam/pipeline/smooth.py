@@ -26,7 +26,7 @@ from cluster_slam.smoothing.rounds import (
     settle,
     solve,
 )
-from cluster_slam.smoothing.world import World, corrected, for_solving, learn, with_unknown_scale, with_variances
+from cluster_slam.smoothing.world import World, corrected, for_solving, learn, say_how_sure, with_unknown_scale
 
 Progress = Callable[[str, float], None]
 
@@ -79,9 +79,7 @@ def smooth(
         frames, model = for_solving(stated, stated_poses, world)
         smoother, estimate = solve(frames, model, world, config, 2, in_stretches=True)
         world = learn(world, smoother, estimate)
-    if world.errs_slowly:  # all observations of a flower say the same: its place is as uncertain as one of them
-        smoother.correlation = float(np.bincount(smoother.landmark, minlength=1).max())
-    _, smoother.poses = with_variances(stated, stated_poses, world.noise)
+    say_how_sure(smoother, stated, stated_poses, world)
     marginals = with_unknown_scale(smoother.marginals(estimate), estimate, world.instruments, session.noise)
     clock.lap("smoothing")
     return make_result(session, frames, world, smoother, estimate, marginals, config, seed, merged, clock.laps)

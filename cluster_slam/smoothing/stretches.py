@@ -50,7 +50,7 @@ def at_rest(moved: Displaced) -> tuple[float, float]:
 
 
 def _lasting(series: Series, square: float) -> float:
-    """Integral over time, s, of the correlation of displacements with mean ``square``, to the lag at which it is lost."""
+    """Integral over time, s, of the correlation of displacements with mean ``square``, until it is lost."""
     total, last_lag, last = 1.0, 0, 1.0
     for lag in _LAGS:
         value, count = series.own_covariance(lag)

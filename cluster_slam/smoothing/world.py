@@ -85,6 +85,14 @@ def _combined(world: World, found: VarianceFactors, *, in_stretches: bool) -> Va
     return VarianceFactors(world.noise.flower * found.flower, world.noise.pose * found.pose, correlation)
 
 
+def say_how_sure(smoother: BatchSmoother, stated: Frames, stated_poses: PoseModel, world: World) -> None:
+    """Let covariances follow from what the last solution has told about the errors."""
+    smoother.correlation = world.noise.correlation
+    if world.errs_slowly:  # all observations of a flower say the same: its place is as uncertain as one of them
+        smoother.correlation = float(np.bincount(smoother.landmark, minlength=1).max())
+    _, smoother.poses = with_variances(stated, stated_poses, world.noise)
+
+
 def with_unknown_scale(
     marginals: Marginals, estimate: Estimate, instruments: Calibration, noise: StatedNoise
 ) -> Marginals:
