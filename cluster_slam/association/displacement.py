@@ -10,6 +10,9 @@ from cluster_slam.association.frames import Frames, information
 from cluster_slam.geometry import Array, rotate_cov, transform
 from cluster_slam.records import IntArray
 
+_WINDOWS_S = (0.4, 1.2)  # over which displacements are averaged
+_SURE_SIGMAS = 3.0  # by which they must exceed their noise before motion is believed: who takes chance for it, errs
+
 
 def presence_of(frame: IntArray, label: IntArray, n_labels: int, n_frames: int) -> csr_matrix:
     """Which frames (n) saw which label (l): a sparse (l, n) matrix of ones."""
@@ -45,29 +48,29 @@ def measured_displacements(
     return (cov @ moment[..., None])[..., 0], cov
 
 
-def motion_scale(
-    d: Array, cov: Array, frame: IntArray, cluster: IntArray, stamps: Array, window_s: float = 0.4
-) -> Array:
+def motion_scale(d: Array, cov: Array, frame: IntArray, cluster: IntArray, stamps: Array) -> Array:
     """How far each pair's cluster stood from rest around that time, m, one sigma along any axis.
 
     The mean square of the measured displacements (p, 3) over a window, less what their noise (p, 3, 3) explains; then
-    the largest such value of the window, so that the beginning of a shake is covered.
+    the largest such value of the window, so that the beginning of a shake is covered. A short window shows a shake
+    when it happens, a long one what is left of it.
     """
     n_clusters = int(cluster.max(initial=-1)) + 1
     n = len(stamps)
     dt = float(np.median(np.diff(stamps))) if n > 1 else 1.0
-    half = max(1, round(0.5 * window_s / dt))
     power, count, noise_sq = np.zeros((3, n, n_clusters))
-    noise = np.trace(cov, axis1=1, axis2=2)
-    power[frame, cluster] = (d * d).sum(1) - noise
+    power[frame, cluster] = (d * d).sum(1) - np.trace(cov, axis1=1, axis2=2)
     noise_sq[frame, cluster] = np.einsum("pij,pij->p", cov, cov)
     count[frame, cluster] = 1.0
-    total, seen, spread = (_window_sum(x, half) for x in (power, count, noise_sq))
-    seen = np.maximum(seen, 1.0)
-    # Var(|d|^2) of pure noise is 2 tr(C^2): two sigma of the mean must be passed before motion is believed.
-    excess = np.maximum(total / seen - 2.0 * np.sqrt(2.0 * spread) / seen, 0.0)
-    local = np.where(excess > 0.0, np.maximum(total / seen, 0.0), 0.0)
-    return np.asarray(np.sqrt(maximum_filter1d(local, 2 * half + 1, axis=0)[frame, cluster] / 3.0))
+    largest = np.zeros((n, n_clusters))
+    for window_s in _WINDOWS_S:
+        half = max(1, round(0.5 * window_s / dt))
+        total, seen, spread = (_window_sum(x, half) for x in (power, count, noise_sq))
+        # Var(|d|^2) of pure noise is 2 tr(C^2).
+        moved = total > _SURE_SIGMAS * np.sqrt(2.0 * spread)
+        local = np.where(moved, total / np.maximum(seen, 1.0), 0.0)
+        largest = np.maximum(largest, maximum_filter1d(local, 2 * half + 1, axis=0))
+    return np.asarray(np.sqrt(largest[frame, cluster] / 3.0))
 
 
 def _window_sum(x: Array, half: int) -> Array:

@@ -20,16 +20,21 @@ from cluster_slam.records import BoolArray
 _LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987)
 _CHI2_3_AT_10 = 0.584  # 10 % quantile of chi-square with three degrees of freedom
 _GATE_CHI2 = 16.0
+_IN_MOTION = 1.01  # times the sigma of clusters at rest
 _LEAST_WHITE = 0.17  # share of the stated variance that changes from frame to frame; sigmas wrong by two leave 0.25
 
 
 @dataclass(frozen=True, slots=True)
 class VarianceFactors:
-    """Factors on stated variances: of flowers, of poses, and how many observations in a row say the same thing."""
+    """Factors on stated variances: of flowers, of poses, and how many observations in a row say the same thing.
+
+    ``sway``: on the squared displacements that clusters in motion are thought to have.
+    """
 
     flower: float
     pose: float
     correlation: float
+    sway: float = 1.0
 
 
 def variance_factors(smoother: BatchSmoother, estimate: Estimate) -> VarianceFactors:
@@ -38,8 +43,8 @@ def variance_factors(smoother: BatchSmoother, estimate: Estimate) -> VarianceFac
     A_z, A_d, residual = smoother.whitened(estimate)
     prior = smoother.pose_information(estimate)
     n = len(estimate.T)
-    free_poses, free_displacements = _taken_up(smoother, A_z, A_d, used, prior)
-    redundancy_flower = 3.0 * (int(used.sum()) - smoother.n_places) - free_poses - free_displacements
+    free_poses, of_displacement = _taken_up(smoother, A_z, A_d, used, prior)
+    redundancy_flower = 3.0 * (int(used.sum()) - smoother.n_places) - free_poses - float(of_displacement.sum())
     redundancy_pose = free_poses
     flower = _ratio(float((residual[used] ** 2).sum()), redundancy_flower)
     pose = 1.0
@@ -48,7 +53,15 @@ def variance_factors(smoother: BatchSmoother, estimate: Estimate) -> VarianceFac
         error = se3_log(inverse(predicted) @ estimate.T)
         seen = np.bincount(smoother.frame[used], minlength=n) > 0
         pose = _ratio(float(np.einsum("ni,nij,nj->", error[seen], prior[seen], error[seen])), redundancy_pose)
-    return VarianceFactors(flower, pose, _correlation_factor(smoother, residual, used, n))
+    sway = _ratio(*_of_sway(smoother, estimate, of_displacement))
+    return VarianceFactors(flower, pose, _correlation_factor(smoother, residual, used, n), sway)
+
+
+def _of_sway(smoother: BatchSmoother, estimate: Estimate, taken: Array) -> tuple[float, float]:
+    """Squares of displacements in motion over what they are thought to be, and their degrees of freedom."""
+    sigma = smoother.pairs.total_sigma
+    moving = sigma > _IN_MOTION * sigma.min(initial=np.inf)
+    return float(((estimate.d[moving] / sigma[moving, None]) ** 2).sum()), float(taken[moving].sum())
 
 
 def errs_slowly(smoother: BatchSmoother, given: Estimate) -> bool:
@@ -68,8 +81,8 @@ def errs_slowly(smoother: BatchSmoother, given: Estimate) -> bool:
     return len(change) >= 30 and float(np.quantile(change, 0.1)) < _LEAST_WHITE * 2.0 * _CHI2_3_AT_10
 
 
-def _taken_up(smoother: BatchSmoother, A_z: Array, A_d: Array, used: BoolArray, prior: Array) -> tuple[float, float]:
-    """Degrees of freedom that the poses (6 each) and the displacements (3 each) take from the observations.
+def _taken_up(smoother: BatchSmoother, A_z: Array, A_d: Array, used: BoolArray, prior: Array) -> tuple[float, Array]:
+    """Degrees of freedom that the poses (6 each) and each displacement (p,) (3) take from the observations.
 
     What an unknown's posterior keeps of its prior it has not taken; displacements are eliminated from each frame's
     pose (Schur complement). What nothing was seen of takes none.
@@ -85,8 +98,7 @@ def _taken_up(smoother: BatchSmoother, A_z: Array, A_d: Array, used: BoolArray, 
     cov_z = np.linalg.inv(total - sums(np.swapaxes(coupling, 1, 2) @ by_pose, smoother.pairs.frame, n))
     cov_d = cov_d + by_pose @ cov_z[smoother.pairs.frame] @ np.swapaxes(by_pose, 1, 2)
     kept_z = float((cov_z * prior).sum())
-    kept_d = float(np.trace(cov_d, axis1=1, axis2=2) @ d_prior)
-    return 6.0 * n - kept_z, 3.0 * n_pairs - kept_d
+    return 6.0 * n - kept_z, 3.0 - np.trace(cov_d, axis1=1, axis2=2) * d_prior
 
 
 def _ratio(square: float, redundancy: float) -> float:

@@ -76,8 +76,10 @@ class Series:
         return (float((self.values[lag:] * self.values[:-lag]).sum()) + missing) / max(3.0 * kept, 1e-30), count
 
 
-def share_left(frames: Frames, T: Array, of: IntArray, frame: IntArray, cov: Array, cov_pose: Array) -> Array:
-    """Share (p,) of its square that a displacement keeps where its frame's pose was solved from the same flowers.
+def taken_by_poses(
+    frames: Frames, T: Array, of: IntArray, frame: IntArray, cov: Array, cov_pose: Array
+) -> tuple[Array, Array]:
+    """What displacements lose where their frames' poses were solved from the same flowers.
 
     A pose has six unknowns, five clusters have fifteen coordinates. Of a frame's displacements d stays
     ``d - H G H' W d``, with H the Jacobians by the pose, W the weights and G the covariance of the pose.
@@ -88,6 +90,10 @@ def share_left(frames: Frames, T: Array, of: IntArray, frame: IntArray, cov: Arr
     of : (m,) displacement that each observation shows, -1 none.
     frame, cov : (p,), (p, 3, 3) frame and noise of each displacement.
     cov_pose : (6, 6) how well each pose is known without its flowers, camera tangent.
+
+    Returns
+    -------
+    Share (p,) of the square of each displacement that is left, and covariance (p, 3, 3) of the noise that is left.
     """
     used, p = of >= 0, len(frame)
     count = np.bincount(of[used], minlength=p)[:, None]
@@ -101,4 +107,4 @@ def share_left(frames: Frames, T: Array, of: IntArray, frame: IntArray, cov: Arr
     G = np.linalg.inv(normal)[frame]
     GH = G @ np.swapaxes(H, 1, 2)
     lost = 2.0 * np.einsum("pai,pai->p", GH, HW) - np.einsum("pai,pab,pbi->p", GH, square[frame], GH)
-    return np.clip(1.0 - lost / 3.0, 0.0, 1.0)
+    return np.clip(1.0 - lost / 3.0, 0.0, 1.0), cov - H @ GH

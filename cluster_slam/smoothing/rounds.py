@@ -26,7 +26,7 @@ from cluster_slam.graph.noise import camera_covs
 from cluster_slam.graph.variance import errs_slowly
 from cluster_slam.grouping import Motion, group_flowers
 from cluster_slam.records import BoolArray
-from cluster_slam.smoothing.displaced import Displaced, share_left
+from cluster_slam.smoothing.displaced import Displaced, taken_by_poses
 from cluster_slam.smoothing.stretches import at_rest, standing_still, stretches
 from cluster_slam.smoothing.world import NO_WEIGHT, World, fewest_observations, scalar_var
 from tracking.gating import chi2_threshold
@@ -93,14 +93,12 @@ def problem(
     """The graph of the session and where its solution starts."""
     of, frame, cluster = cluster_pairs(frames, world.landmark, world.cluster)
     d, cov = measured_displacements(frames, world.T, world.landmark, world.places, of, len(frame))
-    lever_sq = float(np.median((frames.points**2).sum(axis=1))) if len(frames) else 0.0
-    pose_var = model.cov[3, 3] + model.cov[0, 0] * lever_sq
-    scale = motion_scale(d, cov + pose_var * np.eye(3), frame, cluster, frames.stamps)
+    camera, _ = camera_covs(model, world.X)
+    share, left = taken_by_poses(frames, world.T, of, frame, cov, camera)
+    scale = np.sqrt(world.noise.sway) * motion_scale(d, left, frame, cluster, frames.stamps)
     alone = np.bincount(world.cluster, minlength=1).max(initial=0) < 2
     if alone:
         scale = np.zeros_like(scale)  # flowers that stand alone tell no sway from errors of their own
-    camera, _ = camera_covs(model, world.X)
-    share = share_left(frames, world.T, of, frame, cov, camera)
     moved = Displaced(d, cov, share, scale, frame, cluster, frames.stamps)
     rest, lasting_s = (standing_still(cov), 0.0) if alone else at_rest(moved)
     sigma = np.hypot(scale, rest)

@@ -18,7 +18,7 @@ from cluster_slam.records import BoolArray, IntArray
 from cluster_slam.smoothing.displaced import FEWEST, Displaced, Series
 
 _LAGS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 21, 26, 34, 42, 55, 68, 89, 110, 144)
-_WITHIN = 0.5  # of a stretch's sigma: how far a displacement strays from the stretch's mean, a quarter of a sine
+_WITHIN = 0.8  # of a stretch's sigma: a quarter of a sine ends 0.9 of its own rms from its mean
 _CALM_SHARE = 0.1  # of the measurement's sigma: no cluster is known to stand stiller
 _MISTAKE_CHI2 = 16.0  # of a displacement at rest beyond which it is taken for a mistake
 _LOST = 0.1  # correlation that is none any more

@@ -9,12 +9,14 @@ import numpy as np
 from cluster_slam.association.calibration import Calibration, delayed
 from cluster_slam.association.frames import Frames
 from cluster_slam.config import SmoothConfig
+from cluster_slam.errors import EstimationError
 from cluster_slam.geometry import Array
 from cluster_slam.graph.batch import BatchSmoother, Estimate, Marginals, PoseModel
 from cluster_slam.graph.variance import VarianceFactors, variance_factors
 from cluster_slam.records import IntArray, StatedNoise
 from cluster_slam.smoothing.depth_noise import at_expected_depth
 
+_LEAST_FLOWER = 1e-6  # factor on the stated variance of flowers below which nobody errs
 NO_WEIGHT = 1e6  # observations that must not bend the trajectory count as one in so many
 
 
@@ -67,6 +69,11 @@ def learn(world: World, smoother: BatchSmoother, estimate: Estimate) -> World:
     if world.errs_slowly:
         found = VarianceFactors(1.0, 1.0, NO_WEIGHT)  # slow errors hide from residuals: the stated ones stay
     noise = _combined(world, found, in_stretches=len(smoother.pairs.stretch_sigma) > 0)
+    if noise.flower < _LEAST_FLOWER:
+        raise EstimationError(
+            f"the {len(smoother.rows)} observations of {smoother.n_places} flowers repeat to a thousandth of their "
+            "stated errors and do not determine how large these are: are they copies of each other?"
+        )
     depth = np.full(smoother.m, np.nan)
     depth[smoother.rows] = smoother.residuals(estimate)[1][:, 2]
     return replace(world, T=estimate.T, X=estimate.X, places=estimate.places, noise=noise, depth=depth)
@@ -82,7 +89,8 @@ def _combined(world: World, found: VarianceFactors, *, in_stretches: bool) -> Va
         return replace(world.noise, correlation=found.correlation)
     sways = bool(np.bincount(world.cluster, minlength=1).max() > 1)
     correlation = 1.0 if sways and not world.errs_slowly else found.correlation
-    return VarianceFactors(world.noise.flower * found.flower, world.noise.pose * found.pose, correlation)
+    noise = world.noise
+    return VarianceFactors(noise.flower * found.flower, noise.pose * found.pose, correlation, noise.sway * found.sway)
 
 
 def say_how_sure(smoother: BatchSmoother, stated: Frames, stated_poses: PoseModel, world: World) -> None:
