@@ -3,7 +3,7 @@
 Given the places, displacements depend on nothing but their frame's pose (and on the mean of their stretch), poses on
 nothing else. So blocks of 3 x 3 and 6 x 6 are eliminated for all frames at once, then the means of the stretches as
 time goes on, a chunk of frames after the other; places and hand-eye transform are left. It is what GTSAM does with the
-graph of `cluster_slam.graph.batch`, without its bookkeeping: the same numbers, several times faster.
+whole graph (`cluster_slam.graph.whole`), without its bookkeeping: the same numbers, several times faster.
 """
 
 from __future__ import annotations
@@ -17,53 +17,10 @@ from cluster_slam.association.frames import information
 from cluster_slam.association.lanes import pairs_in_lanes, sums
 from cluster_slam.geometry import Array
 from cluster_slam.graph.fronts import Carried, Front, Unknowns, eliminate
+from cluster_slam.graph.linearised import Increments, Linearised, Links
 from cluster_slam.records import IntArray
 
 _CHUNK = 24  # frames that are worked on at once
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Links:
-    """What is connected with what: of q observations, p pairs, s stretches; observations sorted by frame, then pair."""
-
-    frame: IntArray  # (q,)
-    pair: IntArray  # (q,)
-    landmark: IntArray  # (q,)
-    pair_frame: IntArray  # (p,) sorted
-    stretch: IntArray  # (p,) -1 for none
-    n_frames: int
-    n_places: int
-    n_stretches: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Linearised:
-    """Whitened Jacobians and residuals at an estimate, and the priors as information and its vector."""
-
-    A_z: Array  # (q, 3, 6) by the pose
-    A_l: Array  # (q, 3, 3) by the place, or the displacement
-    r: Array  # (q, 3)
-    d: Array  # (p, 3) displacements, less the means of their stretches ...
-    d_information: Array  # (p,) ... known so well
-    b: Array  # (s, 3) means of stretches ...
-    b_information: Array  # (s,) ... known so well
-    z_information: Array  # (n, 6, 6)
-    z_vector: Array  # (n, 6)
-    zx_information: Array  # (n, 6, k) of poses with the hand-eye tangent; k is 6, or 0 where there is none
-    x_information: Array  # (k, k)
-    x_vector: Array  # (k,)
-    place_information: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Increments:
-    """What poses (n, 6), displacements (p, 3), stretches (s, 3), places (l, 3) and the hand-eye (k,) change by."""
-
-    z: Array
-    d: Array
-    b: Array
-    places: Array
-    x: Array
 
 
 def solve_step(links: Links, at: Linearised) -> Increments:
@@ -71,7 +28,7 @@ def solve_step(links: Links, at: Linearised) -> Increments:
     return _Elimination(links, at).increments()
 
 
-def remaining_information(links: Links, at: Linearised) -> Array:
+def remaining(links: Links, at: Linearised) -> Array:
     """Information (3 l + k, 3 l + k) of places and hand-eye transform, all else eliminated."""
     S = _Elimination(links, at).remaining()[0]
     return S[:-1, :-1]

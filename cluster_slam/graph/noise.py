@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cluster_slam.geometry import Array, adjoint, inverse, se3_log
-from cluster_slam.graph.batch import PoseModel
+from cluster_slam.graph.poses import PoseModel
 from cluster_slam.records import Session, StatedNoise
 
 _GAP = 1.5  # usual intervals; odometry over a longer one has not seen the way

@@ -10,8 +10,8 @@ import numpy as np
 
 from cluster_slam.association.frames import Frames, sort_by_frame
 from cluster_slam.config import SmoothConfig
-from cluster_slam.graph.batch import PoseModel
 from cluster_slam.graph.noise import pose_model
+from cluster_slam.graph.poses import PoseModel
 from cluster_slam.records import Result, Session
 from cluster_slam.smoothing.finish import make_result
 from cluster_slam.smoothing.first import first_world

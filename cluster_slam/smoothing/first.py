@@ -14,9 +14,9 @@ from cluster_slam.association.refine import compact, supported
 from cluster_slam.association.tracklets import build_tracklets, relative_pose_cov
 from cluster_slam.config import SmoothConfig
 from cluster_slam.geometry import Array, transform
-from cluster_slam.graph.batch import PoseModel
 from cluster_slam.graph.hand_eye import hand_eye_from_pieces
 from cluster_slam.graph.noise import camera_covs
+from cluster_slam.graph.poses import PoseModel
 from cluster_slam.graph.variance import VarianceFactors
 from cluster_slam.grouping import group_flowers
 from cluster_slam.records import BoolArray, IntArray

@@ -21,8 +21,9 @@ from cluster_slam.association.springs import REST_SIGMA_M
 from cluster_slam.association.templates import Follower, combine_directions
 from cluster_slam.config import SmoothConfig
 from cluster_slam.geometry import transform
-from cluster_slam.graph.batch import BatchSmoother, Estimate, Pairs, PoseModel
+from cluster_slam.graph.batch import BatchSmoother, Estimate, Pairs
 from cluster_slam.graph.noise import camera_covs
+from cluster_slam.graph.poses import PoseModel
 from cluster_slam.graph.variance import errs_slowly
 from cluster_slam.grouping import Motion, group_flowers
 from cluster_slam.records import BoolArray

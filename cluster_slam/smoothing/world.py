@@ -11,7 +11,8 @@ from cluster_slam.association.frames import Frames
 from cluster_slam.config import SmoothConfig
 from cluster_slam.errors import EstimationError
 from cluster_slam.geometry import Array
-from cluster_slam.graph.batch import BatchSmoother, Estimate, Marginals, PoseModel
+from cluster_slam.graph.batch import BatchSmoother, Estimate, Marginals
+from cluster_slam.graph.poses import PoseModel
 from cluster_slam.graph.variance import VarianceFactors, variance_factors
 from cluster_slam.records import IntArray, StatedNoise
 from cluster_slam.smoothing.depth_noise import at_expected_depth
