@@ -35,6 +35,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_files_are_those_of_the_format(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert run(["localise", str(folder / "session"), "--map", str(folder / "session.map"), "-o", str(out), "-q"]) == 0
+    page = (out / "report.html").read_text("utf-8")
+    assert "<svg" in page
+    assert "share within 1 cm, 1 degree" in page
+    assert 'src="http' not in page
     session = open_session(folder / "session")
     truth = open_truth(folder / "session", session)
     assert truth is not None

@@ -63,6 +63,7 @@ def command(
     from cluster_slam.io.session import open_session
     from cluster_slam.pipeline.localise import localise
     from cluster_slam.report.localised import localisation_picture
+    from cluster_slam.report.localised_page import localisation_page
 
     check_output(out)
     options = configured(LocaliseConfig(), config, settings or [])
@@ -82,7 +83,9 @@ def command(
             progress=progress,
         )
         metrics = _metrics(found, session)
-        extra: dict[str, str | bytes] = {"localisation.svg": localisation_picture(found, plants)}
+        picture = localisation_picture(found, plants)
+        page = localisation_page(found, _against_truth(metrics), picture)
+        extra: dict[str, str | bytes] = {"localisation.svg": picture, "report.html": page}
         if metrics:
             extra["metrics.json"] = json.dumps(metrics, indent=2, allow_nan=False) + "\n"
         write_localisation(found, out, extra_files=extra)
@@ -114,10 +117,14 @@ _WORDS = {  # of the summary; metrics.json has all
 }
 
 
-def _tell(found: SessionLocalisation, metrics: dict[str, float | bool], out: Path) -> None:
-    import numpy as np
-
+def _against_truth(metrics: dict[str, float | bool]) -> list[tuple[str, str]]:
     from cluster_slam.cli.summary import shown_metric
+
+    return [(words, shown_metric(name, float(metrics[name]))) for name, words in _WORDS.items() if name in metrics]
+
+
+def _tell(found: SessionLocalisation, metrics: dict[str, float | bool], out: Path) -> None:
+    from cluster_slam.report.localised_page import sureness
 
     print_warnings(found.warnings if found.status == "ok" else ())
     n, located = found.session.n_frames, int(found.is_located.sum())
@@ -129,8 +136,7 @@ def _tell(found: SessionLocalisation, metrics: dict[str, float | bool], out: Pat
         ("lost", ", ".join(f"{count} {reason}" for reason, count in lost if count) or "none"),
     ]
     if located:
-        var = np.nanmedian(np.diagonal(found.covs[found.is_located], axis1=1, axis2=2), axis=0)
-        turn, shift = np.degrees(np.sqrt(var[:3].sum())), 1e3 * np.sqrt(var[3:].sum())
+        turn, shift = sureness(found)
         rows.append(("sure to (one sigma, median)", f"{shift:.2f} mm, {turn:.3f} deg"))
-    rows += [(words, shown_metric(name, float(metrics[name]))) for name, words in _WORDS.items() if name in metrics]
+    rows += _against_truth(metrics)
     print_table(f"cluster-slam localise: {found.status}", [*rows, ("result", str(out))])

@@ -150,13 +150,17 @@ class Track:
         at = self.clusters[cluster].at - self.n_poses
         return self.d[at : at + 3] + self.d[at + 3 : at + 6]
 
-    def associate(self, look: Look, null_density: float) -> tuple[IntArray, IntArray]:
-        """Points and flowers matched one to one, as predicted."""
-        seen = transform(self.T, look.points)
+    def associate(
+        self, look: Look, null_density: float, points: IntArray | None = None, flowers: IntArray | None = None
+    ) -> tuple[IntArray, IntArray]:
+        """Points and flowers matched one to one, as predicted; among the given points and flowers, None: all."""
+        points = np.arange(len(look)) if points is None else points
+        flowers = np.arange(len(self.marks)) if flowers is None else flowers
+        seen = transform(self.T, look.points[points])
         R = self.T[:3, :3]
-        J = np.concatenate([-R @ skew(look.points), np.broadcast_to(R, (len(look), 3, 3))], axis=-1)
-        point_cov = R @ look.covs @ R.T + J @ self.pose_cov @ np.swapaxes(J, 1, 2)
-        places, covs = self._places()
+        J = np.concatenate([-R @ skew(look.points[points]), np.broadcast_to(R, (len(points), 3, 3))], axis=-1)
+        point_cov = R @ look.covs[points] @ R.T + J @ self.pose_cov @ np.swapaxes(J, 1, 2)
+        places, covs = (x[flowers] for x in self._places())
         largest = np.trace(point_cov, axis1=1, axis2=2).max() + np.trace(covs, axis1=1, axis2=2)
         off = seen[:, None] - places
         i, j = np.nonzero((off**2).sum(-1) < GATE_CHI2 * largest)
@@ -164,12 +168,27 @@ class Track:
             return i, j
         S = point_cov[i] + covs[j]
         d2 = mahalanobis_sq(off[i, j], S)
-        cost = np.full((len(look), len(places)), np.inf)
+        cost = np.full((len(points), len(places)), np.inf)
         log_det = np.linalg.slogdet(S)[1]
         cost[i, j] = np.where(d2 < GATE_CHI2, 0.5 * (d2 + log_det + 3.0 * LOG_2PI), np.inf)
         near = np.flatnonzero(np.isfinite(cost).any(0))
         rows, columns = assign(cost[:, near], -float(np.log(null_density)))
-        return rows, near[columns]
+        return points[rows], flowers[near[columns]]
+
+    def _followed_up(
+        self, look: Look, rows: IntArray, flowers: IntArray, null_density: float
+    ) -> tuple[IntArray, IntArray]:
+        """All matches, with those that the first ones open: where a cluster swings shows in part of its flowers."""
+        left = np.setdiff1d(np.arange(len(look)), rows)
+        swings = [c for c, state in self.clusters.items() if state.swing_m > 2.0 * self.scale.sway_m]
+        open_ = np.setdiff1d(np.flatnonzero(np.isin(self.marks.cluster, swings)), flowers)
+        if len(left) == 0 or len(open_) == 0 or len(rows) == 0:
+            return rows, flowers
+        more, which = self.associate(look, null_density, left, open_)
+        if len(more) == 0:
+            return rows, flowers
+        self.update(look, more, which)
+        return np.concatenate([rows, more]), np.concatenate([flowers, which])
 
     def _places(self) -> tuple[Array, Array]:
         """Predicted places (f, 3) of all flowers, and their covariances (f, 3, 3)."""
@@ -266,6 +285,7 @@ class Track:
         predicted, before = self.T, self.pose_cov.copy()
         rows, flowers = self.associate(look, null_density) if len(look) else (np.zeros(0, np.int64),) * 2
         log_likelihood, nis = self.update(look, rows, flowers) if len(rows) else (0.0, 0.0)
+        rows, flowers = self._followed_up(look, rows, flowers, null_density)
         after = self.pose_cov.copy()
         surprise = _pose_surprise(added, before, after, se3_log(inverse(predicted) @ self.T))
         return Step(frame, self.T, after, rows, flowers, predicted, before, log_likelihood, nis, *surprise)
