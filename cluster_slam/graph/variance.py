@@ -11,10 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cluster_slam.association.frames import information
-from cluster_slam.association.lanes import sums
 from cluster_slam.geometry import Array, inverse, se3_log
 from cluster_slam.graph.batch import BatchSmoother, Estimate
+from cluster_slam.graph.innovations import frame_posterior
 from cluster_slam.records import BoolArray
 
 _LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987)
@@ -84,21 +83,11 @@ def errs_slowly(smoother: BatchSmoother, given: Estimate) -> bool:
 def _taken_up(smoother: BatchSmoother, A_z: Array, A_d: Array, used: BoolArray, prior: Array) -> tuple[float, Array]:
     """Degrees of freedom that the poses (6 each) and each displacement (p,) (3) take from the observations.
 
-    What an unknown's posterior keeps of its prior it has not taken; displacements are eliminated from each frame's
-    pose (Schur complement). What nothing was seen of takes none.
+    What an unknown's posterior keeps of its prior it has not taken; what nothing was seen of takes none.
     """
-    A_z, A_d, frame, pair = A_z[used], A_d[used], smoother.frame[used], smoother.pair[used]
-    n, n_pairs = len(prior), len(smoother.pairs.frame)
-    d_prior = smoother.pairs.total_sigma**-2
-    transposed = np.swapaxes(A_d, 1, 2)
-    cov_d = information(sums(transposed @ A_d, pair, n_pairs) + d_prior[:, None, None] * np.eye(3))
-    coupling = sums(transposed @ A_z, pair, n_pairs)
-    by_pose = cov_d @ coupling
-    total = prior + sums(np.swapaxes(A_z, 1, 2) @ A_z, frame, n)
-    cov_z = np.linalg.inv(total - sums(np.swapaxes(coupling, 1, 2) @ by_pose, smoother.pairs.frame, n))
-    cov_d = cov_d + by_pose @ cov_z[smoother.pairs.frame] @ np.swapaxes(by_pose, 1, 2)
-    kept_z = float((cov_z * prior).sum())
-    return 6.0 * n - kept_z, 3.0 - np.trace(cov_d, axis1=1, axis2=2) * d_prior
+    posterior = frame_posterior(smoother, A_z, A_d, used, prior)
+    kept = np.trace(posterior.displacement, axis1=1, axis2=2) / smoother.pairs.total_sigma**2
+    return 6.0 * len(prior) - float((posterior.pose * prior).sum()), 3.0 - kept
 
 
 def _ratio(square: float, redundancy: float) -> float:

@@ -15,6 +15,7 @@ from cluster_slam.association.frames import Frames, chi2_and_log_det
 from cluster_slam.config import SmoothConfig
 from cluster_slam.geometry import rotate_cov, transform
 from cluster_slam.graph.batch import BatchSmoother, Estimate, Marginals
+from cluster_slam.graph.innovations import squared_innovations
 from cluster_slam.landmark_tables import RestMap, cluster_table, drift_table, flower_table
 from cluster_slam.records import BoolArray, Calibration, Diagnostics, IntArray, RejectReason, Result, Session
 from cluster_slam.smoothing.world import World, fewest_observations
@@ -54,7 +55,7 @@ def make_result(
     reasons = np.full(len(frames), int(RejectReason.UNCONFIRMED))
     reasons[frames.order] = reject_reasons(frames, world, estimate, smoother, outlier)
     nis = np.full(len(frames), np.nan)
-    nis[frames.order] = estimate.residual_chi2
+    nis[frames.order] = squared_innovations(smoother, estimate)
     calibration = hand_eye_calibration(smoother, estimate, marginals)
     unobserved = () if calibration is None else tuple(f"hand-eye: {x}" for x in calibration.unobserved)
     return Result(

@@ -58,7 +58,7 @@ function fillMisfit() {
     byId("misfit-words").textContent = "No detection was accepted, so there is nothing to compare.";
     return;
   }
-  byId("misfit-words").textContent = `Squared misfit of accepted detections (NIS over its degrees of freedom): it should be near 1 (a little below is normal, as the map was fitted to these same detections) and inside the shaded band 95 % of the time; here ${(100 * m.inside).toFixed(0)} %. Above the band the map is too confident.`;
+  byId("misfit-words").textContent = `Squared misfit of accepted detections (NIS over its degrees of freedom), each detection against what all the others say of it. It should be near 1 and inside the shaded band 95 % of the time; here ${(100 * m.inside).toFixed(0)} %. Above the band the map is too confident.`;
   const sorted = [...m.mean].sort((a, b) => a - b);
   const top = Math.max(1.6, 1.15 * sorted[Math.floor(0.98 * (sorted.length - 1))], Math.min(3, Math.max(...m.high)));
   const read = (t) => {
