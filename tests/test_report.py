@@ -169,7 +169,7 @@ def test_what_is_wrong_is_said(made: Made) -> None:
     for part in (
         "calls this result poor",
         "1 cluster could not be confirmed",
-        "depth looks like millimetres",
+        "Depth looks like millimetres.",
         "scatter 2.0 times as much",
         "shift along forward",
         "1 landmark was found twice",

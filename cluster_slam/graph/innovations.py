@@ -42,9 +42,11 @@ def frame_posterior(smoother: BatchSmoother, A_z: Array, A_d: Array, used: BoolA
     coupling = sums(transposed @ A_z, pair, len(of_pair))
     by_pose = cov_d @ coupling
     total = prior + sums(np.swapaxes(A_z, 1, 2) @ A_z, frame, n)
-    cov_z = np.linalg.inv(total - sums(np.swapaxes(coupling, 1, 2) @ by_pose, of_pair, n))
+    cov_z: Array = np.asarray(
+        np.linalg.inv(total - sums(np.swapaxes(coupling, 1, 2) @ by_pose, of_pair, n)), np.float64
+    )
     between = -by_pose @ cov_z[of_pair]
-    return FramePosterior(cov_z, cov_d - between @ np.swapaxes(by_pose, 1, 2), between)
+    return FramePosterior(cov_z, cov_d - between @ np.swapaxes(by_pose, 1, 2), np.asarray(between, np.float64))
 
 
 def squared_innovations(smoother: BatchSmoother, estimate: Estimate) -> Array:

@@ -21,6 +21,7 @@ _NOISE_FACTOR = 1.25  # an estimated sigma further than this from the stated one
 _MISFIT_SLACK = 0.2  # how far the mean misfit may be from 1 before it matters in practice
 _LOOSE_MISFIT = 2.0  # a cluster whose misfit is this many times the typical one is named
 _ENOUGH = 20  # detections, from which a cluster's misfit says anything
+_ENOUGH_ALONE = 5  # single flowers, from which it is odd that none of them are a cluster
 _LOOSE_FACTOR = 5.0  # a cluster this much less certain than the typical one is named
 
 
@@ -36,6 +37,7 @@ def find(result: Result, summary: Summary, metrics: Metrics | None) -> tuple[Fin
     """All that is worth a warning, worst first."""
     parts = (
         _status(result, summary),
+        _grouping(summary),
         _rejection(summary),
         _consistency(result, summary),
         _loose_clusters(result),
@@ -45,8 +47,9 @@ def find(result: Result, summary: Summary, metrics: Metrics | None) -> tuple[Fin
         _against_truth(metrics),
     )
     found = [finding for part in parts for finding in part]
-    known = {finding.text for finding in found}
-    found += [Finding("warn", text) for text in (*result.session.warnings, *result.warnings) if text not in known]
+    said = {f"hand-eye: {x}" for x in result.calibration.unobserved} if result.calibration is not None else set()
+    others = dict.fromkeys(text for text in (*result.session.warnings, *result.warnings) if text not in said)
+    found += [Finding("warn", _sentence(text)) for text in others]
     order: list[Level] = ["bad", "warn", "note"]
     return tuple(sorted(found, key=lambda finding: order.index(finding.level)))
 
@@ -61,6 +64,16 @@ def _status(result: Result, summary: Summary) -> Iterator[Finding]:
     if result.merged:
         landmarks = count(len(result.merged), "landmark was", "landmarks were")
         yield Finding("note", f"{landmarks} found twice at first, and merged.")
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")
+
+
+def _grouping(summary: Summary) -> Iterator[Finding]:
+    if summary.n_single >= _ENOUGH_ALONE and not summary.n_clusters:
+        yield Finding("warn", "No two flowers were taken for one cluster: where the plant has clusters, their flowers "
+                      "were seen too badly, or moved too little, to tell which belong together.")  # fmt: skip
 
 
 def _rejection(summary: Summary) -> Iterator[Finding]:
