@@ -104,7 +104,10 @@ class OnlineConfig:
     lost_s: float = 2.0  # a cluster unseen for so long is lost (and comes back as itself)
     keyframe_s: float = 0.2  # the map is solved this often
     regroup_s: float = 1.0  # flowers are grouped this often, sooner where new ones were confirmed
-    calibrate_s: float = 10.0  # the hand-eye transform is estimated for so long at most, then frozen
+    calibrate_s: float = 10.0  # the hand-eye transform is estimated for so long ...
+    calibrated_m: float = 0.0005  # ... and until it is known this well (one sigma, all axes together) ...
+    calibrated_rad: float = 0.001  # ... and so is its rotation ...
+    calibrate_most_s: float = 60.0  # ... or for so long at most; then it is frozen
     undo_s: float = 3.0  # associations can be undone for so long
     follow: TemplateConfig = field(default_factory=TemplateConfig)
     grouping: GroupingConfig = field(default_factory=GroupingConfig)

@@ -21,6 +21,7 @@ import pytest
 from cluster_slam import OnlineTracker, track
 from cluster_slam.cli.app import run
 from cluster_slam.errors import ConfigError, InputError, OutputError
+from cluster_slam.geometry import inverse, se3_log
 from cluster_slam.graph.incremental import FrameMatches, IncrementalMap, eliminate
 from cluster_slam.io.session_writer import write_session
 from cluster_slam.live.replay import Replay
@@ -485,3 +486,17 @@ def test_a_live_source_becomes_a_result(tmp_path: Path) -> None:
     assert result.session.n_frames == 40
     assert len(result.flower_ids) == sum(len(f) for f in given)
     assert any("late" in w for w in result.warnings)
+
+
+def test_the_hand_eye_transform_is_known_as_well_as_is_said() -> None:
+    """Flowers that become landmarks have been seen by the same few frames: what these erred in common counts once."""
+    nees = []
+    for seed in range(4):
+        world = simulate_session(replace(PRESETS["moderate"], duration_s=8.0, fps=15.0, n_clusters=8), seed=seed)
+        session = world.session
+        t = OnlineTracker(session.noise, session.T_flange_camera)
+        for frame in Replay(session).frames():
+            t.step(frame)
+        error = se3_log(inverse(t.X) @ world.hand_eye.true)
+        nees.append(float(error @ np.linalg.solve(t.cov_X, error)) / 6.0)
+    assert np.mean(nees) < 2.2  # 24 degrees of freedom, one in a thousand

@@ -45,7 +45,7 @@ def live(world: World, seen: Seen, view: View, T: Array, w: Array) -> tuple[IntA
     table.told[rows] |= table.confirmed[rows] | is_seen_often | world.births.is_flower(table.kind[rows], n)
     shown[shown] = table.told[rows]
     reasons[(row_of >= 0) & ~shown] = int(RejectReason.UNCONFIRMED)
-    confirm(world, view.stamp)
+    confirm(world, seen, view.stamp)
     return np.where(shown, table.ids[row_of] if len(table) else -1, -1), reasons
 
 
@@ -156,18 +156,23 @@ def note_motion(world: World, seen: Seen, w: Array, S: Array, number: int) -> No
     world.grouping.observe(world.flowers.seat[seen.rows], u, var)
 
 
-def confirm(world: World, stamp: float) -> None:
-    """M of N: tentative flowers that were seen often enough become landmarks."""
+def confirm(world: World, seen: Seen, stamp: float) -> None:
+    """M of N: tentative flowers that were seen often enough become landmarks.
+
+    What they were seen at so far errs with the poses of the same few frames, all in common. The map is told of each by
+    itself: with k times the common variance, which k flowers together never say too much with.
+    """
     table, config = world.flowers, world.config
     times = np.where(world.births.is_doubtful(table.kind), 2, 1)  # a known flower that moved will have been found
     count = np.bitwise_count(table.hits & ((1 << times * config.confirm_of) - 1))
     new = np.flatnonzero(~table.confirmed & (count >= times * config.confirm_hits))
     world.births.became_flowers(table.kind[new])
+    common = (len(seen.rows) + len(new)) * seen.pose.cov
     for row in new.tolist():
         table.confirmed[row] = True
         table.seat[row] = world.grouping.sit()
         cluster, lever = world.clusters[int(table.slot[row])], table.lever[row]
-        cov = table.cov[row] + (cluster.reach**2 + config.slack_m**2) * np.eye(3)
+        cov = table.cov[row] + (cluster.reach**2 + config.slack_m**2) * np.eye(3) + lever @ common @ lever.T
         world.map.include(int(table.ids[row]), table.place[row] - lever @ world.x, cov, lever)
         if cluster.state == "tentative":
             cluster.state = "confirmed"

@@ -168,7 +168,10 @@ class OnlineTracker:
         self.cov_X = solve_all(self.world)
         if self.X0 is not None:
             self.X = self.X0 @ se3_exp(self.world.x)
-        if stamp - self.first_stamp > self.config.calibrate_s:
+        turn, shift = (float(np.sqrt(np.trace(self.cov_X[k : k + 3, k : k + 3]))) for k in (0, 3))
+        is_known = turn < self.config.calibrated_rad and shift < self.config.calibrated_m
+        spent = stamp - self.first_stamp
+        if spent > self.config.calibrate_s and (is_known or spent > self.config.calibrate_most_s):
             self.world.map.freeze(self.world.x)
             self.world.say("calibrated", "hand_eye", 0, 0, "estimated from the flowers, frozen from now on")
 
