@@ -9,7 +9,7 @@ from scipy.sparse import csr_matrix
 from cluster_slam.config import GroupingConfig
 from cluster_slam.geometry import Array
 from cluster_slam.grouping import Motion, group_flowers
-from cluster_slam.grouping.comotion import log_likelihood_ratio, motion_evidence
+from cluster_slam.grouping.comotion import log_likelihood_ratio, motion_evidence, pair_ratios
 from cluster_slam.grouping.partition import Likelihood, improve
 
 N_FRAMES = 600
@@ -57,21 +57,39 @@ def test_no_motion_is_no_evidence() -> None:
 
 @pytest.mark.parametrize(("ratio", "sign"), [(0.0, 1.0), (0.02, 1.0), (0.6, -1.0), (1.0, -1.0)])
 def test_evidence_has_the_sign_of_what_was_seen(ratio: float, sign: float) -> None:
-    value = log_likelihood_ratio(np.array([ratio]), np.array([0.02]), 0.0)[0]
+    value = log_likelihood_ratio(np.array([ratio]), np.array([0.02]), np.array([4.0]), 0.0)[0]
     assert sign * value > 1.5
 
 
 def test_a_poorly_known_ratio_says_little() -> None:
-    assert abs(log_likelihood_ratio(np.array([0.5]), np.array([2.0]), 0.0)[0]) < 0.2
+    assert abs(log_likelihood_ratio(np.array([0.5]), np.array([2.0]), np.array([4.0]), 0.0)[0]) < 0.2
 
 
 def test_evidence_by_hand() -> None:
-    # ratio 0, sigma 0, no turning: N(0; 0, 0.02) = 19.947 against N(0; 0.95, 0.35) = 0.02864 by half and by half
-    # anywhere from 0 to 1.4, the edge of which has 0.5 / 1.4 = 0.35714; and 5 % of anything:
-    # (1 / 2.8 + N(0; 0.5, 0.7)) / 2 = (0.35714 + 0.44159) / 2 = 0.39937
-    apart = 0.5 * 0.02864 + 0.5 * 0.35714
-    expected = np.log((0.95 * 19.947 + 0.05 * 0.39937) / (0.95 * apart + 0.05 * 0.39937))
-    assert log_likelihood_ratio(np.array([0.0]), np.array([0.0]), 0.0)[0] == pytest.approx(expected, rel=1e-3)
+    # ratio 0.01, sigma 0, no turning: N(0.01; 0, 0.02) = 17.603 against N(0.01; 0.66, 0.27) = 0.08145 by 0.7 and by 0.3
+    # anywhere, with power 0.4 + 0.07 * 60 / 7 = 1: 1 / 1.4 = 0.71429, seen in bins of 0.01, the edge of which blurs it:
+    # bins at 0.005 and 0.015 with sigma 0.002887: 0.0071429 * 2 * N(0.005; 0, 0.002887) = 0.44067, the next one
+    # N(0.015; 0, 0.002887) = 1.9e-4 * 0.0071429; and 5 % of anything: (1 / 2.8 + N(0.01; 0.5, 0.7)) / 2 = 0.40177
+    apart = 0.7 * 0.08145 + 0.3 * 0.44067
+    expected = np.log((0.95 * 17.603 + 0.05 * 0.40177) / (0.95 * apart + 0.05 * 0.40177))
+    value = log_likelihood_ratio(np.array([0.01]), np.array([0.0]), np.array([60 / 7]), 0.0)[0]
+    assert value == pytest.approx(expected, rel=1e-3)
+
+
+def test_moving_alike_again_and_again_is_stronger_evidence_than_once() -> None:
+    ratio, sigma = np.full(4, 0.01), np.full(4, 0.01)
+    evidence = log_likelihood_ratio(ratio, sigma, np.array([1.0, 3.0, 9.0, 27.0]), 0.0)
+    assert (np.diff(evidence) > 0.2).all()
+
+
+def test_ratio_of_one_cluster_is_zero_within_its_sigma() -> None:
+    """Leaving out the largest differences leaves less noise than the mean says; without that, ratios are negative."""
+    rng = np.random.default_rng(19)
+    label = np.zeros(12, dtype=np.int64)
+    pairs = np.column_stack(np.triu_indices(12, 1))
+    ratio, sigma, n_stretches = pair_ratios(pairs, motion_of(label, 3.0 * NOISE_M, rng=rng))
+    assert abs(np.mean(ratio / sigma)) < 0.4  # 66 pairs of 12 flowers: as good as 12 independent ones
+    assert (n_stretches > 20).all()  # 20 s of undamped motion: 50 stretches of 0.4 s
 
 
 def test_improving_never_makes_it_less_likely() -> None:

@@ -7,6 +7,10 @@ For two flowers the ratio
 is zero where they move as one and one where they move apart from each other; neighbouring clusters that one touch
 shook lie between. Frames in which the plant moves weigh most; how much it moved is read off the neighbouring frames,
 so that a frame's own noise does not choose it.
+
+Two clusters may swing alike for a moment, but hardly again and again. How often a pair was seen to move is the number
+of equal stretches that would hold as much motion, (sum e)^2 / sum e^2 over the motion e in each stretch (Kish, "Survey
+sampling", 1965); the more there are, the rarer a small ratio of two clusters.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
-from scipy.special import ndtr
+from scipy.stats import chi2
 
 from cluster_slam.geometry import Array
 from cluster_slam.records import BoolArray
@@ -29,10 +33,12 @@ _FEWEST_FRAMES = 5
 _SYSTEMATIC = 0.02  # of an observation's variance: how well places at rest are known, which does not average out
 _SURE = 0.33  # motion of three times its own standard deviation is there at all
 _WRONG = 0.03  # of the frames of a pair: those with the largest differences are left out
-_APART = (0.95, 0.35)  # ratio of flowers of two clusters, mean and sigma; half of them lie anywhere below _RANGE
+_APART = (0.66, 0.27)  # ratio of flowers of two clusters, mean and sigma
+_ALIKE = 0.3  # of pairs of two clusters lie anywhere from 0 to _RANGE instead, with the density of ratio ** (power - 1)
+_POWER = (0.4, 0.07)  # at no stretch of motion, and for each: one touch may move two clusters alike, ten do not
 _ANYTHING = 0.05  # this share of all pairs has any ratio
 _RANGE = 1.4
-_TINY = 1e-9
+_BINS = 140  # of the range
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,21 +56,25 @@ def motion_evidence(places: Array, motion: Motion, reach: float) -> csr_matrix:
     n = len(places)
     if len(pairs) == 0:
         return csr_matrix((n, n))
-    ratio, sigma = _ratios(pairs, motion)
+    ratio, sigma, n_stretches = pair_ratios(pairs, motion)
     known = sigma < _SURE
-    pairs, ratio, sigma = pairs[known], ratio[known], sigma[known]
+    pairs, ratio, sigma, n_stretches = pairs[known], ratio[known], sigma[known], n_stretches[known]
     if len(pairs) == 0:
         return csr_matrix((n, n))
     near = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
-    evidence = log_likelihood_ratio(ratio, sigma, _turning(ratio, sigma, near))
+    evidence = log_likelihood_ratio(ratio, sigma, n_stretches, _turning(ratio, sigma, near))
     upper = csr_matrix((evidence, (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     return csr_matrix(upper + upper.T)
 
 
-def log_likelihood_ratio(ratio: Array, sigma: Array, turning: float) -> Array:
-    """Of ratios with standard deviations ``sigma``; ``turning`` is the usual ratio within a cluster that turns."""
+def log_likelihood_ratio(ratio: Array, sigma: Array, n_stretches: Array, turning: float) -> Array:
+    """Of ratios (p,) with standard deviations ``sigma``, from so many stretches of motion.
+
+    ``turning`` is the usual ratio within a cluster that turns.
+    """
     together = _normal(ratio, 0.5 * turning, np.hypot(sigma, 0.02 + turning))
-    apart = 0.5 * _normal(ratio, _APART[0], np.hypot(sigma, _APART[1])) + 0.5 * _uniform(ratio, sigma)
+    apart = _normal(ratio, _APART[0], np.hypot(sigma, _APART[1]))
+    apart = (1.0 - _ALIKE) * apart + _ALIKE * _anywhere(ratio, sigma, _POWER[0] + _POWER[1] * n_stretches)
     anything = np.where(np.abs(ratio) < _RANGE, 1.0, 0.0) / (2.0 * _RANGE) + _normal(ratio, 0.5, 0.5 * _RANGE + sigma)
     anything = 0.5 * anything
     value: Array = np.log(
@@ -73,10 +83,13 @@ def log_likelihood_ratio(ratio: Array, sigma: Array, turning: float) -> Array:
     return value
 
 
-def _uniform(x: Array, sigma: Array) -> Array:
-    """Density of what lies anywhere between 0 and ``_RANGE``, seen with errors sigma."""
-    sigma = np.maximum(sigma, _TINY)
-    value: Array = (ndtr(x / sigma) - ndtr((x - _RANGE) / sigma)) / _RANGE
+def _anywhere(x: Array, sigma: Array, power: Array) -> Array:
+    """Density of what is distributed as ``power`` (ratio / range) ** (power - 1) / range, seen with errors sigma."""
+    edges = np.linspace(0.0, 1.0, _BINS + 1)
+    mass = np.diff(edges ** power[:, None], axis=1)
+    middle = 0.5 * _RANGE * (edges[1:] + edges[:-1])
+    blurred = np.hypot(sigma, _RANGE / _BINS / np.sqrt(12.0))[:, None]
+    value: Array = (mass * _normal(x[:, None], middle, blurred)).sum(axis=1)
     return value
 
 
@@ -89,16 +102,18 @@ def _turning(ratio: Array, sigma: Array, distance: Array) -> float:
     return float(np.clip(np.median(ratio[nearest]), 0.0, 0.2))
 
 
-def _normal(x: Array, mean: float, sigma: Array) -> Array:
+def _normal(x: Array, mean: float | Array, sigma: Array) -> Array:
     value: Array = np.exp(-0.5 * ((x - mean) / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
     return value
 
 
-def _ratios(pairs: NDArray[Any], motion: Motion) -> tuple[Array, Array]:
-    """Ratios (p,) of pairs (p, 2) with standard deviations (p,); NaN where too little moved."""
+def pair_ratios(pairs: NDArray[Any], motion: Motion) -> tuple[Array, Array, Array]:
+    """Ratios (p,) of pairs (p, 2), standard deviations (p,), stretches of motion (p,); NaN where too little moved."""
     seen = np.isfinite(motion.var)
     power = _power(motion, seen)
-    ratio, sigma = np.full((2, len(pairs)), np.nan)
+    stretch = np.floor((motion.stamps - motion.stamps[0]) / _WINDOW_S).astype(np.int64)
+    share = np.ones(len(pairs))
+    sums = np.full((5, len(pairs)), np.nan)
     for i, (f, g) in enumerate(pairs.tolist()):
         signal = power[:, f] + power[:, g]
         k = np.flatnonzero(seen[:, f] & seen[:, g] & (signal > 0.0))
@@ -106,17 +121,24 @@ def _ratios(pairs: NDArray[Any], motion: Motion) -> tuple[Array, Array]:
             continue
         noise = motion.var[k, f] + motion.var[k, g]
         weight = signal[k] / (signal[k] + noise) / noise
+        moved = np.bincount(stretch[k] - stretch[k[0]], weight * signal[k])
         u_f, u_g = motion.u[k, f], motion.u[k, g]
         difference = weight * ((u_f - u_g) ** 2).sum(-1)
         # A single wrong observation must not part a cluster.
-        weight[np.argsort(difference)[-max(1, round(_WRONG * len(k))) :]] = 0.0
-        bias = 3.0 * float((weight * noise).sum())
-        apart = float((weight * ((u_f - u_g) ** 2).sum(-1)).sum()) - bias
-        total = float((weight * ((u_f**2).sum(-1) + (u_g**2).sum(-1))).sum()) - bias
-        if total > 0.0:
-            ratio[i] = apart / total
-            sigma[i] = np.hypot(np.sqrt(6.0 * float(((weight * noise) ** 2).sum())), _SYSTEMATIC * bias) / total
-    return ratio, sigma
+        kept = np.argsort(difference)[: len(k) - max(1, round(_WRONG * len(k)))]
+        expected = (weight * noise)[kept]
+        both = weight * ((u_f**2).sum(-1) + (u_g**2).sum(-1))
+        n_stretches = moved.sum() ** 2 / (moved**2).sum()
+        squares = float((expected**2).sum())
+        sums[:, i] = difference[kept].sum(), both[kept].sum(), 3.0 * expected.sum(), squares, n_stretches
+        share[i] = len(kept) / len(k)
+    apart, both, noise, squares, n_stretches = sums
+    total = both - noise
+    total[~(total > 0.0)] = np.nan
+    # Of noise alone, whose squares are chi-square, those that are not the largest are smaller than the mean.
+    left = chi2.cdf(chi2.ppf(share, 3), 5) / share
+    sigma: Array = np.hypot(np.sqrt(6.0 * squares), _SYSTEMATIC * noise) / total
+    return (apart - left * noise) / total, sigma, n_stretches
 
 
 def _power(motion: Motion, seen: BoolArray) -> Array:
