@@ -132,13 +132,13 @@ def pair_ratios(pairs: NDArray[Any], motion: Motion) -> tuple[Array, Array, Arra
         squares = float((expected**2).sum())
         sums[:, i] = difference[kept].sum(), both[kept].sum(), 3.0 * expected.sum(), squares, n_stretches
         share[i] = len(kept) / len(k)
-    apart, both, noise, squares, n_stretches = sums
-    total = both - noise
+    different, moved_sq, noise_sq, squares, stretches = sums
+    total = moved_sq - noise_sq
     total[~(total > 0.0)] = np.nan
     # Of noise alone, whose squares are chi-square, those that are not the largest are smaller than the mean.
     left = chi2.cdf(chi2.ppf(share, 3), 5) / share
-    sigma: Array = np.hypot(np.sqrt(6.0 * squares), _SYSTEMATIC * noise) / total
-    return (apart - left * noise) / total, sigma, n_stretches
+    sigma: Array = np.hypot(np.sqrt(6.0 * squares), _SYSTEMATIC * noise_sq) / total
+    return (different - left * noise_sq) / total, sigma, stretches
 
 
 def _power(motion: Motion, seen: BoolArray) -> Array:
