@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from cluster_slam.geometry import Array
-from cluster_slam.records import BoolArray
+from cluster_slam.records import BoolArray, IntArray
 
 _WINDOW_S = 0.4  # motion hardly changes for so long
 _SIGNIFICANT = 11.3  # chi-square, 3 degrees of freedom, 99 %
@@ -112,33 +112,37 @@ def pair_ratios(pairs: NDArray[Any], motion: Motion) -> tuple[Array, Array, Arra
     seen = np.isfinite(motion.var)
     power = _power(motion, seen)
     stretch = np.floor((motion.stamps - motion.stamps[0]) / _WINDOW_S).astype(np.int64)
-    share = np.ones(len(pairs))
-    sums = np.full((5, len(pairs)), np.nan)
+    sums = np.full((6, len(pairs)), np.nan)
     for i, (f, g) in enumerate(pairs.tolist()):
         signal = power[:, f] + power[:, g]
         k = np.flatnonzero(seen[:, f] & seen[:, g] & (signal > 0.0))
-        if len(k) < _FEWEST_FRAMES:
-            continue
-        noise = motion.var[k, f] + motion.var[k, g]
-        weight = signal[k] / (signal[k] + noise) / noise
-        moved = np.bincount(stretch[k] - stretch[k[0]], weight * signal[k])
-        u_f, u_g = motion.u[k, f], motion.u[k, g]
-        difference = weight * ((u_f - u_g) ** 2).sum(-1)
-        # A single wrong observation must not part a cluster.
-        kept = np.argsort(difference)[: len(k) - max(1, round(_WRONG * len(k)))]
-        expected = (weight * noise)[kept]
-        both = weight * ((u_f**2).sum(-1) + (u_g**2).sum(-1))
-        n_stretches = moved.sum() ** 2 / (moved**2).sum()
-        squares = float((expected**2).sum())
-        sums[:, i] = difference[kept].sum(), both[kept].sum(), 3.0 * expected.sum(), squares, n_stretches
-        share[i] = len(kept) / len(k)
-    different, moved_sq, noise_sq, squares, stretches = sums
-    total = moved_sq - noise_sq
+        if len(k) >= _FEWEST_FRAMES:
+            noise = motion.var[k, f] + motion.var[k, g]
+            sums[:, i] = _pair_sums(motion.u[k, f], motion.u[k, g], noise, signal[k], stretch[k] - stretch[k[0]])
+    different, moved, noise_sq, noise_fourth, stretches, kept = sums
+    total = moved - noise_sq
     total[~(total > 0.0)] = np.nan
     # Of noise alone, whose squares are chi-square, those that are not the largest are smaller than the mean.
-    left = chi2.cdf(chi2.ppf(share, 3), 5) / share
-    sigma: Array = np.hypot(np.sqrt(6.0 * squares), _SYSTEMATIC * noise_sq) / total
+    left = chi2.cdf(chi2.ppf(kept, 3), 5) / kept
+    sigma: Array = np.hypot(np.sqrt(6.0 * noise_fourth), _SYSTEMATIC * noise_sq) / total
     return (different - left * noise_sq) / total, sigma, stretches
+
+
+def _pair_sums(u_f: Array, u_g: Array, noise: Array, signal: Array, stretch: IntArray) -> tuple[float, ...]:
+    """Weighted sums over the frames (k,) of a pair whose flowers stand u_f, u_g (k, 3) from rest.
+
+    Squares of differences, of both displacements, of noise, fourth power of noise; stretches of motion; share of frames kept.
+    """
+    weight = signal / (signal + noise) / noise
+    motion_of = np.bincount(stretch, weight * signal)
+    difference = weight * ((u_f - u_g) ** 2).sum(-1)
+    # A single wrong observation must not part a cluster.
+    kept = np.argsort(difference)[: len(noise) - max(1, round(_WRONG * len(noise)))]
+    expected = (weight * noise)[kept]
+    both = (weight * ((u_f**2).sum(-1) + (u_g**2).sum(-1)))[kept]
+    n_stretches = motion_of.sum() ** 2 / (motion_of**2).sum()
+    sums = difference[kept].sum(), both.sum(), 3.0 * expected.sum(), (expected**2).sum(), n_stretches
+    return (*map(float, sums), len(kept) / len(noise))
 
 
 def _power(motion: Motion, seen: BoolArray) -> Array:
