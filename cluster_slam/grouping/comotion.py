@@ -131,7 +131,8 @@ def pair_ratios(pairs: NDArray[Any], motion: Motion) -> tuple[Array, Array, Arra
 def _pair_sums(u_f: Array, u_g: Array, noise: Array, signal: Array, stretch: IntArray) -> tuple[float, ...]:
     """Weighted sums over the frames (k,) of a pair whose flowers stand u_f, u_g (k, 3) from rest.
 
-    Squares of differences, of both displacements, of noise, fourth power of noise; stretches of motion; share of frames kept.
+    Squares of differences, of both displacements, of noise, fourth power of noise; stretches of motion; share of the
+    frames that was kept.
     """
     weight = signal / (signal + noise) / noise
     motion_of = np.bincount(stretch, weight * signal)
