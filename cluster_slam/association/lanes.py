@@ -7,15 +7,16 @@ for all of them. Tables are flat: one row a thing, sorted by lane.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from cluster_slam.association.frames import chi2_and_log_det
 from cluster_slam.geometry import Array
-from cluster_slam.records import IntArray
+from cluster_slam.records import BoolArray, IntArray
 
-_STRETCH = 3.0  # times its run-up: of a stretch
+_STRETCH = 2.0  # times its run-up: of a stretch
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +80,10 @@ def sums(values: Array, group: IntArray, n_groups: int) -> Array:
 
 def run_starts(keys: IntArray) -> IntArray:
     """Where each run of equal keys (q,) begins; q is at least one."""
-    return np.concatenate([[0], np.flatnonzero(np.diff(keys)) + 1])
+    begins = np.empty(len(keys), dtype=bool)
+    begins[0] = True
+    np.not_equal(keys[1:], keys[:-1], out=begins[1:])
+    return begins.nonzero()[0]
 
 
 def near_pairs(
@@ -110,19 +114,22 @@ def assign(
     chosen = (np.bincount(rows)[rows] == 1) & (np.bincount(cols)[cols] == 1)
     rest = np.flatnonzero(~chosen)  # the pairs that compete with others
     if len(rest):
-        starts = run_starts(row_lane[rows[rest]])
-        for competing in np.split(rest, starts[1:]):
-            chosen[competing[_best(rows[competing], cols[competing], gate_chi2 - chi2[competing])]] = True
+        row = rows[rest]
+        r = np.cumsum(np.diff(row, prepend=row[0]) != 0)
+        c = np.unique(cols[rest], return_inverse=True)[1]
+        starts = [*run_starts(row_lane[row]).tolist(), len(rest)]
+        gain = gate_chi2 - chi2[rest]
+        for first, last in pairwise(starts):
+            here = slice(first, last)
+            chosen[rest[here]] = _taken(r[here] - r[first], c[here] - c[here].min(), gain[here])
     return rows[chosen], cols[chosen], chi2[chosen]
 
 
-def _best(rows: IntArray, cols: IntArray, gain: Array) -> IntArray:
-    """Which of the pairs (q,) are taken so that their gains sum to the most."""
-    used_rows, r = np.unique(rows, return_inverse=True)
-    used_cols, c = np.unique(cols, return_inverse=True)
-    table = np.zeros((len(used_rows), len(used_cols)))
+def _taken(r: IntArray, c: IntArray, gain: Array) -> BoolArray:
+    """Which of the pairs (q,) of rows and columns are taken so that their gains sum to the most."""
+    table = np.zeros((int(r[-1]) + 1, int(c.max()) + 1))
     table[r, c] = gain
     a, b = linear_sum_assignment(table, maximize=True)
-    partner = np.full(len(used_rows), -1)
+    partner = np.full(len(table), -1)
     partner[a] = b
-    return np.flatnonzero(partner[r] == c)
+    return np.asarray(partner[r] == c)

@@ -116,14 +116,17 @@ def _log_sizes(size: IntArray) -> float:
 
 def likeliest_cut(tree: Array, likelihood: Likelihood) -> IntArray:
     """Of all cuts of a linkage tree the likeliest."""
-    best: IntArray = np.arange(len(likelihood.places), dtype=np.int64)
-    best_score = -np.inf
-    for height in np.concatenate([[0.0], np.unique(tree[:, 2]) * (1.0 + 1e-12)]):
-        label = fcluster(tree, height, "distance").astype(np.int64) - 1
+    n = len(likelihood.places)
+    label = np.arange(n, dtype=np.int64)
+    best, best_score = label.copy(), likelihood(label)
+    for k, (a, b, height, _) in enumerate(tree):
+        label[(label == int(a)) | (label == int(b))] = n + k  # as `linkage` numbers what it joins
+        if k + 1 < len(tree) and tree[k + 1, 2] <= height * (1.0 + 1e-12):
+            continue  # joined at the same height
         score = likelihood(label)
         if score > best_score:
-            best, best_score = label, score
-    return best
+            best, best_score = label.copy(), score
+    return np.unique(best, return_inverse=True)[1].astype(np.int64)
 
 
 def improve(label: IntArray, likelihood: Likelihood) -> IntArray:
