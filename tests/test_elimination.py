@@ -9,6 +9,7 @@ import pytest
 
 from cluster_slam.association.displacement import cluster_pairs
 from cluster_slam.association.frames import Frames
+from cluster_slam.errors import EstimationError
 from cluster_slam.geometry import Array, inverse, se3_exp, transform
 from cluster_slam.graph import elimination, whole
 from cluster_slam.graph.batch import BatchSmoother, Estimate, Pairs
@@ -122,3 +123,12 @@ def test_degrees_of_freedom_that_unknowns_take_are_those_of_each_frame_alone() -
         taken = np.diag(np.linalg.solve(J.T @ J + P, J.T @ J))
         by_hand += taken[:6].sum(), taken[6:].sum()
     np.testing.assert_allclose([poses, displacements.sum()], by_hand, rtol=1e-9)
+
+
+def test_what_is_not_determined_ends_in_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    """LAPACK's words for it help nobody."""
+    smoother, start = _problem(in_stretches=False, hand_eye=False, seed=1)
+    indefinite = 2.0 * np.ones((3 * N_PLACES, 3 * N_PLACES)) - np.eye(3 * N_PLACES)
+    monkeypatch.setattr("cluster_slam.graph.elimination.remaining", lambda *_: indefinite)
+    with pytest.raises(EstimationError, match="do not determine"):
+        smoother.marginals(start)

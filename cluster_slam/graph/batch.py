@@ -145,14 +145,17 @@ class BatchSmoother:
         try:
             by = self._way().solve_step(self.links, self.linearised(e))
         except (RuntimeError, np.linalg.LinAlgError) as error:  # their words for it are no answer to a person
-            raise EstimationError(
-                f"the {len(self.rows)} observations of {self.n_places} flowers do not determine its poses and "
-                "places in numbers: are they copies of each other, or their covariances far from their errors?"
-            ) from error
+            raise self._undetermined() from error
         self._stretch_mean = by.b if self._stretch_mean is None else self._stretch_mean + by.b
         X = None if e.X is None else e.X @ se3_exp(by.x)
         moved = replace(e, T=e.T @ se3_exp(by.z), X=X, places=e.places + by.places, d=e.d + by.d)
         return self._with_residuals(moved), float(np.abs(by.places).max(initial=0.0))
+
+    def _undetermined(self) -> EstimationError:
+        return EstimationError(
+            f"the {len(self.rows)} observations of {self.n_places} flowers do not determine its poses and "
+            "places in numbers: are they copies of each other, or their covariances far from their errors?"
+        )
 
     def _way(self) -> ModuleType:
         """How the linear problem is solved: odometry ties each pose to the next, which is for GTSAM."""
@@ -223,7 +226,10 @@ class BatchSmoother:
         H = self._way().remaining(self.links, self.linearised(e))
         H = 0.5 * (H + H.T)
         scale = 1.0 / np.sqrt(np.diag(H))
-        L = np.linalg.cholesky(H * scale[:, None] * scale)
+        try:
+            L = np.linalg.cholesky(H * scale[:, None] * scale)
+        except np.linalg.LinAlgError as error:
+            raise self._undetermined() from error
         half = np.linalg.solve(L, np.diag(scale))
         cov = half.T @ half
         n = 3 * self.n_places

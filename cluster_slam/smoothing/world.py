@@ -9,7 +9,6 @@ import numpy as np
 from cluster_slam.association.calibration import Calibration, delayed
 from cluster_slam.association.frames import Frames
 from cluster_slam.config import SmoothConfig
-from cluster_slam.errors import EstimationError
 from cluster_slam.geometry import Array
 from cluster_slam.graph.batch import BatchSmoother, Estimate, Marginals
 from cluster_slam.graph.poses import PoseModel
@@ -17,8 +16,9 @@ from cluster_slam.graph.variance import VarianceFactors, variance_factors
 from cluster_slam.records import IntArray, StatedNoise
 from cluster_slam.smoothing.depth_noise import at_expected_depth
 
-_LEAST_FLOWER = 1e-6  # factor on the stated variance of flowers below which nobody errs
 NO_WEIGHT = 1e6  # observations that must not bend the trajectory count as one in so many
+_FEW_FRAMES = 8  # fewer confirm nothing
+_LEAST_FACTOR = 1e-4  # on stated variances: sessions without any error would leave no variance to reckon with
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,11 +70,7 @@ def learn(world: World, smoother: BatchSmoother, estimate: Estimate) -> World:
     if world.errs_slowly:
         found = VarianceFactors(1.0, 1.0, NO_WEIGHT)  # slow errors hide from residuals: the stated ones stay
     noise = _combined(world, found, in_stretches=len(smoother.pairs.stretch_sigma) > 0)
-    if noise.flower < _LEAST_FLOWER:
-        raise EstimationError(
-            f"the {len(smoother.rows)} observations of {smoother.n_places} flowers repeat to a thousandth of their "
-            "stated errors and do not determine how large these are: are they copies of each other?"
-        )
+    noise = replace(noise, flower=max(noise.flower, _LEAST_FACTOR), pose=max(noise.pose, _LEAST_FACTOR))
     depth = np.full(smoother.m, np.nan)
     depth[smoother.rows] = smoother.residuals(estimate)[1][:, 2]
     return replace(world, T=estimate.T, X=estimate.X, places=estimate.places, noise=noise, depth=depth)
@@ -118,8 +114,14 @@ def with_unknown_scale(
 
 
 def fewest_observations(frames: Frames, config: SmoothConfig) -> int:
-    """Observations of a flower that counts: a few frames cannot confirm anything, there every one stands."""
-    return int(min(config.min_observations, max(1, frames.n_frames // 4)))
+    """Observations of a flower that counts: a few frames cannot confirm anything, there every one stands.
+
+    In short sessions it is a tenth of the frames, at least two: false detections meet in one place by chance the less,
+    the fewer there are.
+    """
+    if frames.n_frames < _FEW_FRAMES:
+        return 1
+    return int(min(config.min_observations, max(2, frames.n_frames // 10)))
 
 
 def scalar_var(frames: Frames, model: PoseModel) -> Array:
