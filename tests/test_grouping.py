@@ -10,7 +10,8 @@ from cluster_slam.config import GroupingConfig
 from cluster_slam.geometry import Array
 from cluster_slam.grouping import Motion, group_flowers
 from cluster_slam.grouping.comotion import log_likelihood_ratio, motion_evidence, pair_ratios
-from cluster_slam.grouping.partition import Likelihood, improve
+from cluster_slam.grouping.likelihood import Likelihood
+from cluster_slam.grouping.partition import improve
 
 N_FRAMES = 600
 STAMPS = np.arange(N_FRAMES) / 30.0
@@ -98,6 +99,17 @@ def test_improving_never_makes_it_less_likely() -> None:
     likelihood = Likelihood(places, 0.5, 0.05, None)
     start = rng.integers(0, 8, 30)
     assert likelihood(improve(start, likelihood)) >= likelihood(start)
+
+
+def test_a_change_of_two_clusters_is_as_likely_as_the_partition_anew() -> None:
+    rng = np.random.default_rng(23)
+    places = rng.uniform(0, 0.4, (20, 3))
+    evidence = np.triu(rng.normal(size=(20, 20)) * (rng.random((20, 20)) < 0.3), 1)
+    likelihood = Likelihood(places, 0.5, 0.05, csr_matrix(evidence + evidence.T))
+    a, b, c = np.arange(7), np.arange(7, 12), np.arange(12, 20)
+    sums = likelihood.changed(likelihood.sums([a, b, c]), [a, b], [np.arange(9), np.arange(9, 12)])
+    label = np.repeat([0, 1, 2], [9, 3, 8])
+    assert likelihood.of(sums) == pytest.approx(likelihood(label), abs=1e-9)
 
 
 def test_evidence_of_few_pairs_is_not_diluted_by_the_other_members() -> None:

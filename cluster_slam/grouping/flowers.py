@@ -16,7 +16,8 @@ from cluster_slam.config import GroupingConfig
 from cluster_slam.errors import ConfigError
 from cluster_slam.geometry import Array
 from cluster_slam.grouping.comotion import Motion, motion_evidence
-from cluster_slam.grouping.partition import Likelihood, improve, likeliest_cut
+from cluster_slam.grouping.likelihood import Likelihood
+from cluster_slam.grouping.partition import improve, likeliest_cut
 from cluster_slam.records import IntArray
 
 _FEWEST = 3  # members of what is called a cluster where nothing else says that flowers come in clusters
