@@ -97,8 +97,12 @@ def touch_noise(dt: float, config: MotionConfig) -> Array:
 
     A velocity v ~ N(0, touch_speed^2) for a time t, uniform in (0, dt): E[t^2] = dt^2 / 3, E[t] = dt / 2.
     """
-    shares = np.array([[dt * dt / 3.0, dt / 2.0], [dt / 2.0, 1.0]])
-    return np.kron(shares, np.eye(3)) * config.touch_speed**2
+    cov = np.zeros((6, 6))
+    axes, var = np.arange(3), config.touch_speed**2
+    cov[axes, axes] = dt * dt / 3.0 * var
+    cov[axes, axes + 3] = cov[axes + 3, axes] = dt / 2.0 * var
+    cov[axes + 3, axes + 3] = var
+    return cov
 
 
 def amplitude(x: Array, anchor: Array) -> float:

@@ -63,14 +63,14 @@ def associate(world: World, view: View, cov_hand_eye: Array) -> Seen:
     P = at.P[table.slot[rows]] + place_cov
     found = match(predicted, P, w, view.S + J @ cov_z @ np.swapaxes(J, 1, 2), config.gate_chi2)
 
-    def pose_of(m: Matches) -> PoseSolution:
+    def pose_of(m: Matches, n_iterations: int = 3) -> PoseSolution:
         if not len(m.rows):
             return no_pose(cov_z)
         W = information(view.S[m.cols] + place_cov[m.rows])
         slot = table.slot[rows[m.rows]]
-        return solve_pose(J[m.cols], predicted[m.rows] - w[m.cols], W, slot, at.P, prior)
+        return solve_pose(J[m.cols], predicted[m.rows] - w[m.cols], W, slot, at.P, prior, n_iterations=n_iterations)
 
-    pose = pose_of(found)
+    pose = pose_of(found, 2)
     moved = transform(view.T @ se3_exp(pose.z), view.c)
     found = match(predicted, P, moved, view.S + J @ pose.cov @ np.swapaxes(J, 1, 2), config.gate_chi2)
     better = search(world, view, rows, found, predicted, moved, at)

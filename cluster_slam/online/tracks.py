@@ -14,8 +14,12 @@ def tracks_of(world: World, stamp: float, flower_ids: IntArray | None) -> Tracks
     n = len(world.clusters)
     positions, velocities, covs = world.anchors(), np.zeros((n, 3)), world.covs_at_rest(stamp)
     for j, k in enumerate(world.clusters):
-        if k.is_moving or k.trembling is not None:
+        if k.is_moving:
             positions[j], velocities[j], covs[j] = k.now(stamp)
+        elif k.trembling is not None and stamp <= k.last:
+            d, P = k.trembling
+            positions[j] += d
+            covs[j, :3, :3] = P + k.anchor_cov
     seen = np.isin(world.flowers.ids, np.zeros(0) if flower_ids is None else flower_ids)
     return Tracks(
         ids=world.names(),
