@@ -20,8 +20,7 @@ from cluster_slam.graph.fronts import Carried, Front, Unknowns, eliminate
 from cluster_slam.graph.linearised import Increments, Linearised, Links
 from cluster_slam.records import IntArray
 
-_CHUNK = 1500  # observations that are worked on at once, about; ...
-_CHUNK_OF_STRETCHES = 600  # ... where there are stretches, of which a front then holds few; ...
+_CHUNK = 1000  # observations that are worked on at once, about ...
 _MOST_FRAMES = 120  # ... and from so many frames at most
 
 
@@ -116,8 +115,7 @@ class _Elimination:
         np.maximum.at(end, links.stretch[within], links.pair_frame[within])
         fronts: list[Front] = []
         carried = Carried.nothing(self.k + 1)
-        size = _CHUNK_OF_STRETCHES if links.n_stretches else _CHUNK
-        step = int(np.clip(size * links.n_frames // max(len(links.frame), 1), 1, _MOST_FRAMES))
+        step = int(np.clip(_CHUNK * links.n_frames // max(len(links.frame), 1), 1, _MOST_FRAMES))
         for first in range(0, links.n_frames, step):
             last = first + step
             chunk = self._chunk(first, last)
