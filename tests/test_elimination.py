@@ -80,9 +80,9 @@ def test_step_is_that_of_the_whole_graph(in_stretches: bool, hand_eye: bool) -> 
 
 
 @pytest.mark.parametrize(("in_stretches", "hand_eye"), CASES)
-def test_marginals_are_those_of_the_whole_graph(in_stretches: bool, hand_eye: bool) -> None:
+def test_marginals_of_the_whole_graph_are_those_of_the_closed_form(in_stretches: bool, hand_eye: bool) -> None:
     smoother, e = _problem(in_stretches=in_stretches, hand_eye=hand_eye, seed=5)
-    cov = np.linalg.inv(whole.remaining(smoother.links, smoother.linearised(e)))
+    cov = np.linalg.inv(elimination.remaining(smoother.links, smoother.linearised(e)))
     found = smoother.marginals(e)
     n = 3 * N_PLACES
     np.testing.assert_allclose(found.places, cov[:n, :n], rtol=1e-6, atol=1e-9 * cov[:n, :n].max())
@@ -129,6 +129,6 @@ def test_what_is_not_determined_ends_in_a_word(monkeypatch: pytest.MonkeyPatch) 
     """LAPACK's words for it help nobody."""
     smoother, start = _problem(in_stretches=False, hand_eye=False, seed=1)
     indefinite = 2.0 * np.ones((3 * N_PLACES, 3 * N_PLACES)) - np.eye(3 * N_PLACES)
-    monkeypatch.setattr("cluster_slam.graph.elimination.remaining", lambda *_: indefinite)
+    monkeypatch.setattr("cluster_slam.graph.whole.remaining", lambda *_: indefinite)
     with pytest.raises(EstimationError, match="do not determine"):
         smoother.marginals(start)

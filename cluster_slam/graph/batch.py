@@ -6,18 +6,16 @@ cluster over a stretch of frames in which it moves. An observation k of flower j
 
     c_k = T_world_camera[i]^-1 (l_j + d_p) + noise
 
-The residuals are linearised for all observations at once in NumPy. What is linear is solved in one of two ways: where
-each pose is known for itself all but places and hand-eye transform are eliminated in closed form, where odometry ties
-poses together GTSAM eliminates the whole graph. Both give the joint marginal of places and hand-eye transform, too.
-Wrong associations are weighted out
-by graduated non-convexity with truncated least squares (Yang et al., "Graduated Non-Convexity for Robust Spatial
-Perception", RA-L 2020, eq. 14 and remark 5).
+The residuals are linearised for all observations at once in NumPy. What is linear GTSAM solves by eliminating the whole
+factor graph; that gives the joint marginal of places and hand-eye transform, too. On the way there, where each pose is
+known for itself, all but places and hand-eye transform are eliminated in closed form: the same step, several times
+sooner. Wrong associations are weighted out by graduated non-convexity with truncated least squares (Yang et al.,
+"Graduated Non-Convexity for Robust Spatial Perception", RA-L 2020, eq. 14 and remark 5).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from types import ModuleType
 
 import numpy as np
 
@@ -140,10 +138,15 @@ class BatchSmoother:
     _stretch_mean: Array | None = None
     _lever: Array | None = None
 
-    def step(self, e: Estimate) -> tuple[Estimate, float]:
-        """One Gauss-Newton step and the size of the largest change of a place, m."""
+    def step(self, e: Estimate, *, in_gtsam: bool = False) -> tuple[Estimate, float]:
+        """One Gauss-Newton step and the size of the largest change of a place, m.
+
+        ``in_gtsam``: by eliminating the whole factor graph, where the closed form would do, too.
+        """
+        # odometry ties each pose to the next: the closed form knows no such chain
+        way = whole if in_gtsam or self.poses.cov_step is not None else elimination
         try:
-            by = self._way().solve_step(self.links, self.linearised(e))
+            by = way.solve_step(self.links, self.linearised(e))
         except (RuntimeError, np.linalg.LinAlgError) as error:  # their words for it are no answer to a person
             raise self._undetermined() from error
         self._stretch_mean = by.b if self._stretch_mean is None else self._stretch_mean + by.b
@@ -156,10 +159,6 @@ class BatchSmoother:
             f"the {len(self.rows)} observations of {self.n_places} flowers do not determine its poses and "
             "places in numbers: are they copies of each other, or their covariances far from their errors?"
         )
-
-    def _way(self) -> ModuleType:
-        """How the linear problem is solved: odometry ties each pose to the next, which is for GTSAM."""
-        return elimination if self.poses.cov_step is None else whole
 
     def linearised(self, e: Estimate) -> Linearised:
         """The problem at an estimate, every observation weighted by its robust weight."""
@@ -222,13 +221,13 @@ class BatchSmoother:
         return e
 
     def marginals(self, e: Estimate) -> Marginals:
-        """Joint covariance of places and hand-eye transform; all else is eliminated."""
-        H = self._way().remaining(self.links, self.linearised(e))
-        H = 0.5 * (H + H.T)
-        scale = 1.0 / np.sqrt(np.diag(H))
+        """Joint covariance of places and hand-eye transform; all else is eliminated, by GTSAM."""
         try:
+            H = whole.remaining(self.links, self.linearised(e))
+            H = 0.5 * (H + H.T)
+            scale = 1.0 / np.sqrt(np.diag(H))
             L = np.linalg.cholesky(H * scale[:, None] * scale)
-        except np.linalg.LinAlgError as error:
+        except (RuntimeError, np.linalg.LinAlgError) as error:
             raise self._undetermined() from error
         half = np.linalg.solve(L, np.diag(scale))
         cov = half.T @ half

@@ -79,6 +79,7 @@ def smooth(
         frames, model = for_solving(stated, stated_poses, world)
         smoother, estimate = solve(frames, model, world, config, 2, in_stretches=True)
         world = learn(world, smoother, estimate)
+    estimate, _ = smoother.step(estimate, in_gtsam=True)
     say_how_sure(smoother, stated, stated_poses, world)
     marginals = with_unknown_scale(smoother.marginals(estimate), estimate, world.instruments, session.noise)
     clock.lap("smoothing")
