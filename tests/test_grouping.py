@@ -9,7 +9,7 @@ from scipy.sparse import csr_matrix
 from cluster_slam.config import GroupingConfig
 from cluster_slam.geometry import Array
 from cluster_slam.grouping import Motion, group_flowers
-from cluster_slam.grouping.comotion import log_likelihood_ratio, motion_evidence, pair_ratios
+from cluster_slam.grouping.comotion import log_likelihood_ratio, motion_evidence, pair_ratios, turning_ratio
 from cluster_slam.grouping.likelihood import Likelihood
 from cluster_slam.grouping.partition import improve
 
@@ -60,6 +60,22 @@ def test_no_motion_is_no_evidence() -> None:
 def test_evidence_has_the_sign_of_what_was_seen(ratio: float, sign: float) -> None:
     value = log_likelihood_ratio(np.array([ratio]), np.array([0.02]), np.array([4.0]), 0.0)[0]
     assert sign * value > 1.5
+
+
+def test_turning_is_read_off_near_pairs_and_grows_with_the_square_of_the_distance() -> None:
+    rng = np.random.default_rng(29)
+    distance = np.concatenate([rng.uniform(0.01, 0.05, 200), [0.08]])
+    ratio = 40.0 * distance**2 + 0.005 * rng.standard_normal(201)
+    usual = turning_ratio(ratio, np.full(201, 0.005), distance, 0.05)
+    np.testing.assert_allclose(usual, 40.0 * distance**2, rtol=0.1)
+    known, rigid = (
+        log_likelihood_ratio(ratio[-1:], np.array([0.005]), np.array([6.0]), t)[0] for t in (usual[-1:], 0.0)
+    )
+    assert known > 0.5 > -2.0 > rigid  # 0.26 apart is what a cluster that turns does over 8 cm
+
+
+def test_rigid_clusters_do_not_turn() -> None:
+    assert (turning_ratio(np.full(50, -0.01), np.full(50, 0.02), np.linspace(0.01, 0.08, 50), 0.05) == 0.0).all()
 
 
 def test_a_poorly_known_ratio_says_little() -> None:

@@ -36,6 +36,11 @@ _WRONG = 0.03  # of the frames of a pair: those with the largest differences are
 _APART = (0.66, 0.27)  # ratio of flowers of two clusters, mean and sigma
 _ALIKE = 0.3  # of pairs of two clusters lie anywhere from 0 to _RANGE instead, with the density of ratio ** (power - 1)
 _POWER = (0.4, 0.07)  # at no stretch of motion, and for each: one touch may move two clusters alike, ten do not
+_RIGID = 0.02  # ratio within a cluster that does not turn
+_NEAR = 0.3  # of the reach: flowers so near each other are mostly of one cluster
+_TELLS = 0.1  # standard deviation of a ratio that tells of turning
+_FEWEST_PAIRS = 10
+_MOST_TURNING = 0.3
 _ANYTHING = 0.05  # this share of all pairs has any ratio
 _RANGE = 1.4
 _BINS = 140  # of the range
@@ -61,18 +66,18 @@ def motion_evidence(places: Array, motion: Motion, reach: float) -> csr_matrix:
     pairs, ratio, sigma, n_stretches = pairs[known], ratio[known], sigma[known], n_stretches[known]
     if len(pairs) == 0:
         return csr_matrix((n, n))
-    near = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
-    evidence = log_likelihood_ratio(ratio, sigma, n_stretches, _turning(ratio, sigma, near))
+    distance = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
+    evidence = log_likelihood_ratio(ratio, sigma, n_stretches, turning_ratio(ratio, sigma, distance, _NEAR * reach))
     upper = csr_matrix((evidence, (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     return csr_matrix(upper + upper.T)
 
 
-def log_likelihood_ratio(ratio: Array, sigma: Array, n_stretches: Array, turning: float) -> Array:
+def log_likelihood_ratio(ratio: Array, sigma: Array, n_stretches: Array, turning: Array | float) -> Array:
     """Of ratios (p,) with standard deviations ``sigma``, from so many stretches of motion.
 
-    ``turning`` is the usual ratio within a cluster that turns.
+    ``turning`` is the usual ratio of such a pair within a cluster that turns.
     """
-    together = _normal(ratio, 0.5 * turning, np.hypot(sigma, 0.02 + turning))
+    together = _normal(ratio, 0.5 * turning, np.hypot(sigma, _RIGID + turning))
     apart = _normal(ratio, _APART[0], np.hypot(sigma, _APART[1]))
     apart = (1.0 - _ALIKE) * apart + _ALIKE * _anywhere(ratio, sigma, _POWER[0] + _POWER[1] * n_stretches)
     anything = np.where(np.abs(ratio) < _RANGE, 1.0, 0.0) / (2.0 * _RANGE) + _normal(ratio, 0.5, 0.5 * _RANGE + sigma)
@@ -93,13 +98,19 @@ def _anywhere(x: Array, sigma: Array, power: Array) -> Array:
     return value
 
 
-def _turning(ratio: Array, sigma: Array, distance: Array) -> float:
-    """Usual ratio of the nearest pairs, mostly of one cluster: clusters that turn as they sway are not rigid."""
-    sure = sigma < 0.1
-    if sure.sum() < 10:
-        return 0.0
-    nearest = sure & (distance <= np.quantile(distance[sure], 0.1))
-    return float(np.clip(np.median(ratio[nearest]), 0.0, 0.2))
+def turning_ratio(ratio: Array, sigma: Array, distance: Array, near: float) -> Array:
+    """Usual ratio (p,) of two flowers of one cluster at ``distance`` (p,) m: clusters turn as they sway.
+
+    It grows with the square of the distance; by how much is said by pairs within ``near`` m, mostly of one cluster.
+    """
+    tell = np.flatnonzero((sigma < _TELLS) & (distance < near))
+    if len(tell) < _FEWEST_PAIRS:
+        return np.zeros_like(ratio)
+    a_square_metre = ratio[tell] / distance[tell] ** 2
+    order = np.argsort(a_square_metre)
+    weight = np.cumsum((distance[tell] ** 2 / np.hypot(sigma[tell], _RIGID))[order])
+    median = float(a_square_metre[order[np.searchsorted(weight, 0.5 * weight[-1])]])
+    return np.clip(median * distance**2, 0.0, _MOST_TURNING)
 
 
 def _normal(x: Array, mean: float | Array, sigma: Array) -> Array:
