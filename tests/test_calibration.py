@@ -12,7 +12,7 @@ import pytest
 from cluster_slam.cli.app import run
 from cluster_slam.errors import ConfigError, EstimationError, InputError
 from cluster_slam.geometry import Array, inverse, se3_exp, se3_log, transform, tum_from_pose
-from cluster_slam.graph.calibration import StillPoints, larger, motion_pairs, park_martin, refine_mounting
+from cluster_slam.graph.calibration import StillPoints, larger, motion_pairs, no_worse, park_martin, refine_mounting
 from cluster_slam.pipeline.calibrate import calibrate
 from cluster_slam.pipeline.calibrate_board import parse_board
 from cluster_slam.sensors.interpolation import interpolate
@@ -110,6 +110,33 @@ def test_the_larger_of_two_covariances_holds_both() -> None:
         assert np.linalg.eigvalsh(both - b)[0] > -1e-9
         assert np.linalg.eigvalsh(both - a)[0] > -1e-9
     np.testing.assert_allclose(larger(0.5 * np.eye(3), np.eye(3)), np.eye(3))
+
+
+def test_no_session_makes_worse_what_was_known() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        a, b = (m @ m.T + 0.1 * np.eye(6) for m in rng.normal(size=(2, 6, 6)))
+        both = no_worse(a, np.linalg.solve(b, np.eye(6)))
+        assert np.linalg.eigvalsh(b - both)[0] > -1e-9
+        assert np.linalg.eigvalsh(a - both)[0] > -1e-9
+    np.testing.assert_allclose(no_worse(0.5 * np.eye(3), np.eye(3)), 0.5 * np.eye(3))
+
+
+def test_an_arm_that_turns_about_one_axis_is_told_which_are_missing() -> None:
+    made = simulate_session(replace(MODERATE, duration_s=3.0, fps=10.0), seed=5)
+    turns = np.zeros((made.session.n_frames, 6))
+    turns[:, 1] = 0.3 * np.sin(np.linspace(0.0, 6.0, made.session.n_frames))
+    swung = made.session.poses[0] @ se3_exp(turns)
+    X = made.hand_eye.true
+    true = np.asarray(made.truth.T_world_camera)
+    o = made.session.observations
+    moved = inverse(swung @ X)[o.frame] @ true[o.frame]
+    points = (moved[:, :3, :3] @ o.points[..., None])[..., 0] + moved[:, :3, 3]
+    found = calibrate(replace(made.session, poses=swung, observations=replace(o, points=points)))
+    assert found.status == "poor"
+    assert sum("turn the flange about its" in words for words in found.advice) == 2
+    xi = se3_log(inverse(found.mounting.X) @ X)
+    assert xi @ np.linalg.solve(found.mounting.cov, xi) < 30.0
 
 
 def test_flowers_calibrate_their_camera(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from cluster_slam.association.calibration import delayed
 from cluster_slam.geometry import Array, inverse, se3_exp, se3_log, transform
-from cluster_slam.localisation.instruments import corrected
+from cluster_slam.localisation.instruments import news_of, put_right
 from cluster_slam.localisation.landmarks import Landmarks, landmarks
 from cluster_slam.localisation.motion import motion_of
 from cluster_slam.localisation.planar import flat_world
@@ -79,8 +79,18 @@ def test_a_clock_of_odometry_that_is_ahead_does_not_move_the_frames() -> None:
     """Frames are where the camera was when it looked, whatever odometry's clock says."""
     session, true, _ = drive(300, np.random.default_rng(4))
     ahead = replace(session, poses=delayed(session.poses, session.stamps, -0.4))  # shows what comes 0.4 s later
-    right, steps = corrected(ahead), inverse(true[:-1]) @ true[1:]
+    right, steps = put_right(ahead).session, inverse(true[:-1]) @ true[1:]
     off = [se3_log(inverse(inverse(P[:-1]) @ P[1:]) @ steps)[20:-20] for P in (ahead.poses, right.poses)]
     before, after = (float(np.sqrt((x[:, 1] ** 2).mean())) for x in off)
     assert after < 0.8 * before
     assert after < 0.013  # odometry's own noise is 0.01 rad a step
+
+
+def test_points_of_a_piece_count_for_less_the_closer_they_follow() -> None:
+    piece, times = np.array([0, 1, 0, 0, 1]), np.array([0.0, 0.0, 0.1, 60.0, 10.0])
+    news = news_of(piece, times)
+    np.testing.assert_array_equal(news[:2], 1.0)
+    c = 0.8 * np.exp(-1.0)
+    assert news[4] == pytest.approx((1.0 - c) / (1.0 + c))
+    assert news[2] < 0.13
+    assert news[3] > 0.99

@@ -167,24 +167,28 @@ def _covariance(J: Array, r: Array, weight: Array, seen: StillPoints, prior: Arr
     naive: Array = np.linalg.solve(H, np.eye(len(H)))
     cov = 0.5 * (naive + naive.T)
     for n in _N_STRETCHES:
-        left_out = _without_each(J, r, weight, seen.label, stretches(seen.stamps, n))
+        left_out = _without_each(J, r, weight, seen.label, stretches(seen.stamps, n), prior)
         m, p = left_out.shape
         few = (m - 1.0) / (m - p) if m > p else 1.0  # m stretches tell a p x p covariance roughly only (Hotelling 1931)
         if m > 1:
             cov = larger(few * (m - 1.0) / m * left_out.T @ left_out + naive @ prior @ naive, cov)
-    return cov
+    return no_worse(cov, prior)
 
 
-def _without_each(J: Array, r: Array, weight: Array, label: IntArray, stretch: IntArray) -> Array:
-    """By how much (m, p) the answer moves, to first order, where one of the stretches (q,) is left out (jackknife)."""
+def _without_each(J: Array, r: Array, weight: Array, label: IntArray, stretch: IntArray, prior: Array) -> Array:
+    """By how much (m, p) the answer moves, to first order, where one of the stretches (q,) is left out (jackknife).
+
+    The prior's information (p, p) stays: what the session does not show cannot move further than was known before.
+    """
     out = []
     several = np.unique(stretch)
+    at_rest = np.einsum("q,qia,qi->a", weight, J, r, optimize=True)  # what the prior holds against at the answer
     for k in several if len(several) > 1 else []:
         rest = stretch != k
         w = weight[rest]
         A, b = J[rest] - _means(J[rest], w, label[rest]), r[rest] - _means(r[rest], w, label[rest])
-        H = np.einsum("q,qia,qib->ab", w, A, A, optimize=True)
-        g = np.einsum("q,qia,qi->a", w, A, b, optimize=True)
+        H = np.einsum("q,qia,qib->ab", w, A, A, optimize=True) + prior
+        g = np.einsum("q,qia,qi->a", w, A, b, optimize=True) - at_rest
         out.append(np.linalg.solve(H + 1e-9 * np.trace(H) / len(H) * np.eye(len(H)), g))
     return np.array(out).reshape(len(out), J.shape[2])
 
@@ -197,6 +201,18 @@ def larger(a: Array, b: Array) -> Array:
     grown = L @ axes
     out: Array = (grown * np.maximum(values, 1.0)) @ grown.T
     return 0.5 * (out + out.T)
+
+
+def no_worse(cov: Array, prior: Array) -> Array:
+    """The covariance, but along no direction more than before the session, as the prior's information (p, p) has it.
+
+    Stretches are few, and a jackknife may claim that a session has made known worse what was known.
+    """
+    L = np.linalg.cholesky(prior)
+    values, axes = np.linalg.eigh(L.T @ cov @ L)
+    half = np.linalg.solve(L.T, axes * np.sqrt(np.minimum(values, 1.0)))
+    out: Array = half @ half.T
+    return out
 
 
 def _scatter(seen: StillPoints, X: Array, offset: float, scale: float) -> float:

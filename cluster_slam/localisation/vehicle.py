@@ -25,7 +25,6 @@ _STEP_SCALE, _STEP_DOF = 1.5, 4.0  # odometry slips: its steps err by Student's 
 _WIDE, _WIDE_SHARE = 4.0, 0.1  # points may also err so many times more, this share of them
 _FALSE_SHARE = 0.03  # of the points
 _NEAR = (2.0, 0.7)  # over the landmarks' usual spacing, and rad, about a mode: one place
-_ALIKE = 0.3  # errors of successive points are alike: each counts as so much of an independent one
 _SURE = 0.99  # of the particles in one place
 _LOST_POINTS, _LOST_SHARE = 15, 0.7  # of the last points no landmark's: all is open again
 _GAIN, _OFFSET = 0.03, 0.05  # one sigma of what ranges err by for good: a share, and m ...
@@ -59,8 +58,8 @@ class FlatFollower:
         self.frame = 0
         self._misses: list[float] = []
 
-    def step(self, frame: int, points: Array, covs: Array) -> FlatPlace:
-        """The next frame, with points (n, 3) and covariances (n, 3, 3)."""
+    def step(self, frame: int, points: Array, covs: Array, news: Array) -> FlatPlace:
+        """The next frame, with points (n, 3), covariances (n, 3, 3), and what each counts for (n,)."""
         q = points @ self.flat.camera[:, :2]
         S = self.flat.camera[:, :2].T @ covs @ self.flat.camera[:, :2]
         if len(self.state) == 0 or (len(self._misses) >= _LOST_POINTS and np.mean(self._misses) > _LOST_SHARE):
@@ -70,7 +69,7 @@ class FlatFollower:
             self._move(frame)
         self.frame = frame
         for k in range(len(q)):
-            self._see(q[k], S[k])
+            self._see(q[k], S[k], float(news[k]))
         if len(q):
             self._resample()
         return self._place(q, S)
@@ -100,11 +99,11 @@ class FlatFollower:
         keep = np.sqrt(1.0 - _WANDER**2)
         self.state[:, 3:] = keep * self.state[:, 3:] + _WANDER * self.rng.normal(size=(n, 2)) * [_GAIN, _OFFSET]
 
-    def _see(self, q: Array, S: Array) -> None:
-        """Weigh all particles by one point."""
+    def _see(self, q: Array, S: Array, news: float) -> None:
+        """Weigh all particles by one point, which counts as so much of an independent one."""
         close, total = self._densities(q, S)
         false = _FALSE_SHARE / self.area
-        self.log_weight = self.log_weight + _ALIKE * np.log((1.0 - _FALSE_SHARE) * total + false)
+        self.log_weight = self.log_weight + news * np.log((1.0 - _FALSE_SHARE) * total + false)
         w = self._weights()
         self._misses = [*self._misses[-(_LOST_POINTS - 1) :], float(w @ (close < 0.01))]
 

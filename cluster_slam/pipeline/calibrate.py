@@ -29,7 +29,8 @@ SCALE_SIGMA = 0.05  # of the depth scale
 _POOR_SHIFT_M = 0.005  # a direction of the shift that is known no better is worth a word ...
 _POOR_TURN_RAD = 0.009  # ... and so is a turn
 _STILL_RAD = 0.03  # root mean square turn below which the flange has not turned about an axis
-_LITTLE_LEARNT = 0.5  # of the variances before, geometric mean over all directions: more left is poor
+_LITTLE_LEARNT = 0.5  # of the variance before, in the direction that was learnt least: if more is left, and motions
+# are missing or a direction is known poorly, the whole is poor
 _AXES = ("x", "y", "z")
 
 
@@ -210,14 +211,13 @@ def report_on(
     """What was found with what it is worth, and advice."""
     excitation = _excitation(session)
     advice = _advice(mounting.cov[:6, :6], excitation)
-    prior = pose_model(session).cov_hand_eye
-    left = np.exp((np.linalg.slogdet(mounting.cov[:6, :6])[1] - np.linalg.slogdet(prior)[1]) / 6.0)
+    left = _left_to_learn(mounting.cov[:6, :6], pose_model(session).cov_hand_eye)
     still = bool((excitation < _STILL_RAD).all())
     warnings = list(session.warnings)
     status: Literal["ok", "poor"] = "ok"
-    if still or left > _LITTLE_LEARNT or len(unobserved) >= 3:
+    if still or (left > _LITTLE_LEARNT and advice) or len(unobserved) >= 3:
         status = "poor"
-        warnings.append("the motions say little of the mounting" + ("; the arm did not turn" if still else ""))
+        warnings.append("the motions do not tell all of the mounting" + ("; the arm did not turn" if still else ""))
     return CalibrationReport(
         session,
         mounting,
@@ -231,6 +231,13 @@ def report_on(
         tuple(warnings),
         status,
     )
+
+
+def _left_to_learn(cov: Array, prior: Array) -> float:
+    """Share of the variance before, that is left in the direction in which least was learnt (largest eigenvalue)."""
+    L = np.linalg.cholesky(prior)
+    half = np.linalg.solve(L, cov)
+    return float(np.linalg.eigvalsh(np.linalg.solve(L, half.T))[-1])
 
 
 def _excitation(session: Session) -> Array:

@@ -13,7 +13,7 @@ from cluster_slam.config import LocaliseConfig
 from cluster_slam.geometry import Array, inverse, se3_exp, se3_log
 from cluster_slam.localisation import Landmarks, Localisation, Localiser
 from cluster_slam.localisation.following import Follower, Place
-from cluster_slam.localisation.instruments import corrected
+from cluster_slam.localisation.instruments import put_right
 from cluster_slam.localisation.learning import Seen, learn_scale
 from cluster_slam.localisation.merging import merged_points
 from cluster_slam.localisation.motion import Motion, motion_of
@@ -237,11 +237,12 @@ def _flat_world(session: Session, motion: Motion, localiser: Localiser) -> Flat 
 def _on_floor(frames: _Frames, flat: Flat, marks: Landmarks, seed: int, say: Progress) -> list[Place]:
     """Frames of a vehicle on a floor, one after the other."""
     say("finding what the instruments err by", 0.05)
-    right = corrected(frames.session)
-    follower = FlatFollower(flat, marks, motion_of(right), np.random.default_rng(seed))
-    o, out = right.observations, []
+    right = put_right(frames.session)
+    follower = FlatFollower(flat, marks, motion_of(right.session), np.random.default_rng(seed))
+    o, out = right.session.observations, []
     for i in _told(frames.session.n_frames, say):
-        p = follower.step(i, o.points[frames.rows[i]], o.covs[frames.rows[i]])
+        rows = frames.rows[i]
+        p = follower.step(i, o.points[rows], o.covs[rows], right.news[rows])
         one = (p.probability, p.T_map_camera)
         out.append(
             Place(p.reason, marks.plant, p.probability, p.T_map_camera, p.cov, p.flower_ids, p.cluster_ids, (one,))
