@@ -16,7 +16,7 @@ from cluster_slam.sensors.depth import DepthModel
 
 _ALIKE = 1.8  # flowers of one picture differ in width by less than this factor from the middle one
 _MIN_ALIKE = 5  # flowers that say what is usual
-_SEEN = 0.65  # share of a box that is petals with a depth; below, one depth in five is of what hides the rest
+_SEEN = 0.72  # share of a box that is petals with a depth; of half, one depth in five is of what hides the rest
 
 
 @dataclass(frozen=True, slots=True, eq=False)

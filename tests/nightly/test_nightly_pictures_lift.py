@@ -22,14 +22,15 @@ from cluster_slam.simulate.session import simulate_session
 N_SEEDS = 2
 BINS = (0.15, 0.25, 0.35, 0.45, 0.6, 0.75, 0.9)
 NEAR = (0.16, 0.28, 0.45, 0.6)  # least distance of the camera, m
-SEEN = 0.5  # share of a flower that is seen
+SEEN = 0.2  # share of a flower that is seen: less than that no detector finds
 WRONG = 30.0  # chi-square, 3 degrees of freedom: the depth is of something else (1e-6 of good ones lie beyond)
+FIRST_SEED = 310  # 300 and 301 were looked at when the lifting was made
 
 
 def errors(name: str, n_seeds: int) -> NDArray:
     """Rows of depth and normalised squared error; boxes err by 1 px and 8 % in size, intrinsics as the model says."""
     rows = []
-    for seed in range(300, 300 + n_seeds):
+    for seed in range(FIRST_SEED, FIRST_SEED + n_seeds):
         for near in NEAR:
             config = replace(
                 MODERATE, duration_s=10.0, fps=0.8, distance_min_m=near, distance_max_m=near + 0.1, n_clusters=16,
@@ -76,9 +77,11 @@ def test_covariances_are_true_at_every_depth(name: str) -> None:
     wrong = rows[:, 1] > WRONG
     _say(f"{name}: {len(rows)} flowers, {100 * wrong.mean():.1f} % at a wrong depth")
     for low, high in pairwise(BINS):
-        part = rows[(rows[:, 0] >= low) & (rows[:, 0] < high) & ~wrong, 1]
+        inside = (rows[:, 0] >= low) & (rows[:, 0] < high)
+        part = rows[inside & ~wrong, 1]
         if len(part) >= 20:
-            _say(f"  {low} to {high} m: {len(part)} flowers, ANEES / 3 {part.mean() / 3:.2f}")
+            every = rows[inside, 1].mean() / 3
+            _say(f"  {low} to {high} m: {len(part)} flowers, ANEES / 3 {part.mean() / 3:.2f}, with all {every:.2f}")
             spread = 3 * np.sqrt(2 / 3 / len(part))
             assert 0.8 - spread < part.mean() / 3 < 1.25 + spread
-    assert wrong.mean() < 0.04
+    assert wrong.mean() < 0.01
