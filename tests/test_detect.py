@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cluster_slam.cli.app import run
 from cluster_slam.detect import ColourDetector, open_detector
 from cluster_slam.detect.decode import RawBoxes, suppressed
-from cluster_slam.detect.onnx import OnnxDetector
+from cluster_slam.detect.onnx import OnnxDetector, own_model
 from cluster_slam.detect.preprocess import Scaling, prepare
 from cluster_slam.detect.signature import Kind, Port, Signature, class_names, recognise
 from cluster_slam.errors import ConfigError, InputError
@@ -194,3 +194,20 @@ def test_of_a_folder_of_images(tmp_path: Path) -> None:
     (out / "notes.txt").write_text("mine")
     assert run(arguments) == 2
     assert run(["detect", str(tmp_path / "none"), "-o", str(tmp_path / "o2"), "--detector", "colour"]) == 2
+
+
+def test_pictures_of_other_sizes_between_change_nothing() -> None:
+    """Memory is used again from picture to picture; what stood in it is not seen."""
+    detector = open_detector(score=0.0)
+    rng = np.random.default_rng(3)
+    first, second = (rng.integers(0, 255, (*size, 3)).astype(np.uint8) for size in ((96, 128), (96, 130)))
+    expected = detector.detect(first)
+    for other in (255 - first, second):
+        detector.detect(other)
+    again = detector.detect(first)
+    np.testing.assert_array_equal(again.scores, expected.scores)
+    np.testing.assert_array_equal(again.centres, expected.centres)
+
+
+def test_our_own_model_is_small() -> None:
+    assert own_model().stat().st_size < 1_000_000

@@ -14,7 +14,7 @@ METADATA = {
     "stride": "16",
     "names": "{0: 'flower'}",
     "license": "MIT",
-    "score": "0.5",
+    "score": "0.54",
     "pixel_origin": "centre",
 }
 

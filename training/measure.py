@@ -32,35 +32,35 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("model", help="an ONNX file, own, or colour")
     options.add_argument("--worlds", type=int, default=12)
+    options.add_argument("--first", type=int, default=HELD_OUT, help="seed of the first plant")
     options.add_argument("--usual", action="store_true", help="plants and light of a usual session, not random ones")
     options.add_argument("--coco", type=Path)
     options.add_argument("--category", default="flower")
     options.add_argument("--calibrate", action="store_true")
+    options.add_argument("--at", type=float, default=0.5, help="score at which groups of flowers are counted")
     chosen = options.parse_args()
     is_file = chosen.model.endswith(".onnx")
     detector = open_detector(chosen.model if is_file else None, name=None if is_file else chosen.model, score=0.02)
     if chosen.coco is not None:
         tables = annotated(detector, chosen.coco, chosen.category)
     else:
-        tables = rendered(detector, chosen.worlds, chosen.usual)
-    scores, hits, n_wanted, errors = (
-        np.concatenate([t[0] for t in tables]),
-        np.concatenate([t[1] for t in tables]),
-        sum(t[2] for t in tables),
-        np.concatenate([t[3] for t in tables]),
-    )
-    report(scores, hits, n_wanted)
+        tables = rendered(detector, range(chosen.first, chosen.first + chosen.worlds), chosen.usual)
+    scores, hits, errors, flowers = (np.concatenate([table[i] for table in tables]) for i in range(4))
+    report(scores, hits, int(flowers[:, 0].sum()))
+    if chosen.coco is None:
+        by_group(flowers, chosen.at)
     if len(errors):
         a, b = centre_sigma(errors)
         print(f"middle of a box: sigma of u and of v = hypot({a:.2f} px, {b:.3f} of its size)")
+        print(f"its mean error: {errors[:, 0].mean():+.2f} px in u, {errors[:, 1].mean():+.2f} px in v")
         if chosen.calibrate:
             state(Path(chosen.model), {"sigma_px": f"{a:.3f} {b:.4f}", "pixel_origin": "centre"})
 
 
-def rendered(detector: object, n_worlds: int, usual: bool) -> list[tuple]:
+def rendered(detector: object, seeds: range, usual: bool) -> list[tuple]:
     """Matches in the pictures of held-out worlds."""
     tables = []
-    for seed in range(HELD_OUT, HELD_OUT + n_worlds):
+    for seed in seeds:
         for picture in usual_world(seed) if usual else render_world(seed):
             b = picture.boxes
             is_big = b.sizes.max(1) >= _MIN_PX
@@ -69,7 +69,7 @@ def rendered(detector: object, n_worlds: int, usual: bool) -> list[tuple]:
             wanted = (b.visible >= SEEN) & is_big & inside
             known = b.visible >= HIDDEN
             found = detector.detect(picture.colour)
-            tables.append(matched(found, np.column_stack([b.centres, b.sizes]), wanted, known & ~wanted))
+            tables.append(matched(found, np.column_stack([b.centres, b.sizes]), wanted, known & ~wanted, b.visible))
     return tables
 
 
@@ -92,27 +92,54 @@ def annotated(detector: object, path: Path, category: str) -> list[tuple]:
         corner = np.array(rows, float).reshape(-1, 4)
         boxes = np.column_stack([corner[:, :2] + corner[:, 2:] / 2 - 0.5, corner[:, 2:]])
         found = detector.detect(image)
-        tables.append(matched(found, boxes, np.ones(len(boxes), bool), np.zeros(len(boxes), bool)))
+        every = np.ones(len(boxes))
+        tables.append(matched(found, boxes, every > 0, every < 0, every))
     return tables
 
 
-def matched(found: ImageDetections, boxes: np.ndarray, wanted: np.ndarray, ignored: np.ndarray) -> tuple:
-    """Scores and hits (IoU 0.5, best score first, each box once), how many were wanted, errors of the middles."""
-    scores, hits, errors, taken = [], [], [], np.zeros(len(boxes), bool)
+def matched(
+    found: ImageDetections, boxes: np.ndarray, wanted: np.ndarray, ignored: np.ndarray, visible: np.ndarray
+) -> tuple:
+    """Scores and hits (IoU 0.5, best score first, each box once), errors of the middles, and flowers one by one.
+
+    A flower's row: whether it is wanted, which share of it is seen, its shorter and longer side, the largest IoU with
+    another that is to be seen, and the score it was found with, 0 where it was not.
+    """
+    scores, hits, errors, by = [], [], [], np.zeros(len(boxes))
     for k in range(len(found)):
         overlap = iou(np.concatenate([found.centres[k], found.sizes[k]]), boxes)
-        free = np.where(wanted & ~taken, overlap, 0.0)
+        free = np.where((wanted | ignored) & (by == 0), overlap * (1.0 + wanted), 0.0)  # those that are wanted first
         j = int(free.argmax()) if len(free) else -1
-        if j >= 0 and free[j] >= 0.5:
-            taken[j] = True
-            scores.append(found.scores[k])
-            hits.append(True)
-            if found.scores[k] > 0.35:
+        is_hit = j >= 0 and free[j] > 0 and overlap[j] >= 0.5
+        if is_hit:
+            by[j] = found.scores[k]
+            if wanted[j] and found.scores[k] > 0.35:
                 errors.append([*(found.centres[k] - boxes[j, :2]), np.sqrt(boxes[j, 2:].prod())])
-        elif not (len(overlap) and (np.where(ignored, overlap, 0.0) > 0.3).any()):
+        if (is_hit and wanted[j]) or not (len(overlap) and (np.where(ignored, overlap, 0.0) > 0.3).any()):
             scores.append(found.scores[k])
-            hits.append(False)
-    return np.array(scores), np.array(hits, bool), int(wanted.sum()), np.array(errors).reshape(-1, 3)
+            hits.append(bool(is_hit and wanted[j]))
+    crowd = np.array(
+        [np.delete(np.where(visible > HIDDEN, iou(b, boxes), 0.0), i).max(initial=0.0) for i, b in enumerate(boxes)]
+    )
+    rows = np.column_stack([wanted, visible, boxes[:, 2:].min(1), boxes[:, 2:].max(1), crowd.reshape(-1), by])
+    flowers = rows[wanted | ignored].reshape(-1, 6)
+    return np.array(scores), np.array(hits, bool), np.array(errors).reshape(-1, 3), flowers
+
+
+def by_group(flowers: np.ndarray, least: float) -> None:
+    """Recall over which share of a flower is seen, over its shorter side, and over how much others overlap it."""
+    is_found, is_wanted = flowers[:, 5] >= least, flowers[:, 0] > 0
+    groups = (
+        ("seen", 1, (HIDDEN, 0.2, SEEN, 0.5, 0.65, 0.8, 0.95, 1.01), flowers[:, 3] >= _MIN_PX),
+        ("shorter side, px", 2, (0, 6, 8, 10, 14, 20, 1000), is_wanted),
+        ("IoU with another", 4, (0, 0.01, 0.1, 0.25, 0.5, 1.01), is_wanted),
+    )
+    for name, column, edges, counted in groups:
+        print(f"{name}, at score {least}:")
+        for low, high in pairwise(edges):
+            part = counted & (flowers[:, column] >= low) & (flowers[:, column] < high)
+            if part.any():
+                print(f"  {low} to {high}: {int(part.sum())} flowers, recall {is_found[part].mean():.2f}")
 
 
 def iou(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:

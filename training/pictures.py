@@ -16,7 +16,7 @@ from cluster_slam.simulate.session import simulate_session
 
 SEEN = 0.35  # share of a flower that is seen, from which it should be found ...
 HIDDEN = 0.08  # ... and below which it should not; what is between counts neither way
-N_FRAMES = 12  # of one plant
+N_FRAMES = 8  # of one plant
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,6 +24,7 @@ class Example:
     """A crop and its flowers."""
 
     image: NDArray[np.uint8]  # (s, s, 3) blue, green, red
+    is_backdrop: NDArray[np.bool_]  # (s, s)
     boxes: NDArray[np.float32]  # (k, 5) u, v, width, height, share that is seen
 
 
@@ -89,10 +90,10 @@ def crops(picture: Picture, size: int, count: int, rng: np.random.Generator) -> 
         else:
             middle = rng.uniform([0, 0], [width, height])
         low = np.clip(np.rint(middle - size / 2), 0, [width - size, height - size]).astype(int)
-        image = picture.colour[low[1] : low[1] + size, low[0] : low[0] + size].copy()
+        part = (slice(low[1], low[1] + size), slice(low[0], low[0] + size))
         moved = table - np.array([low[0], low[1], 0, 0, 0], np.float32)
         inside = (moved[:, :2] > -2).all(1) & (moved[:, :2] < size + 2).all(1)
-        found.append(Example(image, moved[inside]))
+        found.append(Example(picture.colour[part].copy(), picture.is_backdrop[part].copy(), moved[inside]))
     return found
 
 

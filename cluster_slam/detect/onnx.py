@@ -94,6 +94,7 @@ class OnnxDetector:
         self.kind, self.signature = kind, signature
         self._session, self._prompt = session, prompt
         self._config = preprocessor_config(signature.path)
+        self._tensor: NDArray[np.float32] | None = None  # of the last picture
         self._classes = _flower_classes(signature, kind)
         stated = signature.metadata.get("score")
         self._least = score if score is not None else float(stated) if stated else _LEAST.get(kind, 0.4)
@@ -102,7 +103,8 @@ class OnnxDetector:
     def detect(self, image: NDArray[np.uint8]) -> ImageDetections:
         """Boxes of the flowers in a picture (h, w, 3), 8 bits, blue green red; best first."""
         scaling = self._scaling(image)
-        tensor, placement = prepare(image, scaling)
+        tensor, placement = prepare(image, scaling, self._tensor)
+        self._tensor = tensor
         raw = self._run(tensor, image, scaling)
         keep = raw.scores >= self._least
         if self._classes is not None:
@@ -173,15 +175,18 @@ class OnnxDetector:
 
     def _feed(self, tensor: NDArray[np.float32], image: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
         """All inputs that the model has, and no other."""
-        known: dict[str, NDArray[Any]] = {
-            self.signature.image.name: tensor.astype(np.float16) if "float16" in self.signature.image.kind else tensor,
-            "orig_target_sizes": np.array([image.shape[1::-1]], np.int64),
-            "pixel_mask": np.ones((1, *tensor.shape[2:]), np.int64),
-        }
+        names = {port.name for port in self.signature.inputs}
+        is_half = "float16" in self.signature.image.kind
+        feed: dict[str, NDArray[Any]] = {self.signature.image.name: tensor.astype(np.float16) if is_half else tensor}
+        if "orig_target_sizes" in names:
+            feed["orig_target_sizes"] = np.array([image.shape[1::-1]], np.int64)
+        if "pixel_mask" in names:
+            feed["pixel_mask"] = np.ones((1, *tensor.shape[2:]), np.int64)
         if self._prompt is not None:
             ids = self._prompt.ids
-            known |= {"input_ids": ids, "token_type_ids": np.zeros_like(ids), "attention_mask": np.ones_like(ids)}
-        return {port.name: known[port.name] for port in self.signature.inputs if port.name in known}
+            words = {"input_ids": ids, "token_type_ids": np.zeros_like(ids), "attention_mask": np.ones_like(ids)}
+            feed |= {name: value for name, value in words.items() if name in names}
+        return feed
 
 
 def _flower_classes(signature: Signature, kind: Kind) -> NDArray[np.int64] | None:

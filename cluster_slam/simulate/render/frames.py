@@ -38,6 +38,7 @@ class Picture:
     depth: NDArray[np.uint16]  # (h, w) in units of the depth model, 0 none
     boxes: Boxes
     z: NDArray[np.float32]  # (h, w) true depth, m
+    is_backdrop: NDArray[np.bool_]  # (h, w) what stands behind all plants
 
 
 class Renderer:
@@ -66,7 +67,8 @@ class Renderer:
         linear = shade(self.scene, self.shadows, kept, painted)
         colour = photograph(linear, look, float(self._light[k]), self._flow(k), rng)
         depth = measure(painted.z, self.depth_model, colour, look.holes, rng)
-        return Picture(colour, depth, self._boxes(k, T_camera_world, world, kept, painted), painted.z)
+        behind = np.append(facets.textures[kept.index] == Texture.BACKDROP, True)[painted.facet]
+        return Picture(colour, depth, self._boxes(k, T_camera_world, world, kept, painted), painted.z, behind)
 
     def _placed(self, k: int) -> Placed:
         motion, leaves = self.made.motion, self.made.leaves
