@@ -21,7 +21,7 @@ from cluster_slam.io.map.check import problems
 from cluster_slam.io.map.incoming import read_incoming, read_landmarks
 from cluster_slam.io.map.ledger import ask, events, record
 from cluster_slam.io.map.merge import merge_map
-from cluster_slam.io.map.store import MapStore
+from cluster_slam.io.map.store import MapStore, refused
 from cluster_slam.io.map.times import iso, seconds
 from cluster_slam.io.map.write import undo
 from cluster_slam.pipeline.remember import add
@@ -387,6 +387,13 @@ def test_disk_full(tmp_path: Path) -> None:
             add(store, rest_incoming(grown(5)), plant="another, with rows of its own")
         assert dump(store) == before
         assert problems(store) == []
+
+
+def test_no_room_for_the_journal(tmp_path: Path) -> None:
+    """SQLite calls it an I/O error: the map is not damaged."""
+    error = refused(tmp_path / "a.map", sqlite3.OperationalError("disk I/O error"))
+    assert isinstance(error, OutputError)
+    assert "is the disk full?" in str(error)
 
 
 def test_a_bug_on_the_way_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -108,35 +108,37 @@ class Follower:
         return float(np.sqrt(rate_sq))
 
     def _follow(self, shift: _Shift) -> None:
-        v, moved, c = self.values, self.moved, shift.cluster
-        members, found, theirs, residual, weight = (
-            shift.members,
-            shift.found,
-            shift.theirs,
-            shift.residual,
-            shift.weight,
-        )
-        mean, R = shift.mean, shift.cov
+        v, c = self.values, shift.cluster
+        offset = self._move(c, shift.mean, shift.cov)
+        v["cluster_time"][c] = v["cluster_last_seen"][c] = v["cluster_last_looked_at"][c] = self.now
+        self._measure_growth(c, shift.found, shift.theirs, shift.weight)
+        self._move_flowers(shift, offset)
+
+    def _move(self, c: int, mean: Array, R: Array) -> Array:
+        """Kalman update of a cluster's place and drift with how far it was from where it was expected: the shift."""
+        v, moved = self.values, self.moved
         walked = (self.walk_rate**2 - self.plant.walk_rate**2) * abs(self.dt[c]) / DAY_S
         P = moved.cluster_covs[c] + walked * np.eye(3)
         nis = float(mean @ np.linalg.solve(P + R, mean)) / 3.0
         inflate = max(1.0, nis)  # it moved farther than was thought possible: its drift is less known than was thought
         P, C, V = (inflate * m for m in (P, moved.position_velocity_covs[c], moved.velocity_covs[c]))
         S = P + R
-        K = np.linalg.solve(S, P).T
-        Kv = np.linalg.solve(S, C).T
-        offset = K @ mean
+        K, Kv = np.linalg.solve(S, P).T, np.linalg.solve(S, C).T
         v["cluster_covs"][c] = _symmetric(P - K @ P)
         v["velocities"][c] = moved.velocities[c] + Kv @ mean
         v["velocity_covs"][c] = _symmetric(V - Kv @ C)
         v["position_velocity_covs"][c] = C - K @ C
-        v["cluster_time"][c] = v["cluster_last_seen"][c] = v["cluster_last_looked_at"][c] = self.now
-        self._measure_growth(c, found, theirs, weight)
+        shift: Array = K @ mean
+        return shift
+
+    def _move_flowers(self, shift: _Shift, offset: Array) -> None:
+        """All flowers go with their cluster; those that were seen also to where they were seen in it."""
+        v, moved, members, found = self.values, self.moved, shift.members, shift.found
         v["flowers"][members] = moved.flowers[members] + offset
         v["flower_covs"][members] = moved.flower_covs[members]
-        F, Q = moved.flower_covs[found], self.where.covs[theirs]
+        F, Q = moved.flower_covs[found], self.where.covs[shift.theirs]
         gain = np.swapaxes(np.linalg.solve(F + Q, F), 1, 2)
-        v["flowers"][found] += (gain @ (residual - offset)[..., None])[..., 0]
+        v["flowers"][found] += (gain @ (shift.residual - offset)[..., None])[..., 0]
         v["flower_covs"][found] = _symmetric(F - gain @ F)
 
     def learn_growth(self) -> None:

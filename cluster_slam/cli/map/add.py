@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cluster_slam.cli.map.options import AlignOption, MapArgument, is_similarity, opened, print_columns
+from cluster_slam.cli.map.options import AlignOption, MapArgument, is_similarity, opened
+from cluster_slam.cli.map.told import added_json, tell_added, tell_completed
 from cluster_slam.cli.options import ConfigOption, JsonOption, QuietOption, SetOption, configured
 from cluster_slam.cli.progress import StageProgress
 from cluster_slam.cli.summary import print_json, print_warnings
@@ -18,7 +19,6 @@ from cluster_slam.errors import ConfigError
 if TYPE_CHECKING:
     from cluster_slam.io.map.incoming import Incoming
     from cluster_slam.io.map.store import MapStore, StoredSession
-    from cluster_slam.pipeline.remember import Added
 
 OptionalResult = Annotated[Path | None, typer.Argument(metavar="[RESULT]", help="Result folder.", show_default=False)]
 
@@ -69,7 +69,7 @@ def add(
         left = _left_incomplete(store, incoming, result)
         if left is not None and result is not None:
             complete_result(result, store, left)
-            return _tell_completed(left, quiet=quiet, as_json=as_json)
+            return tell_completed(left, quiet=quiet, as_json=as_json)
         added = add_session(
             store,
             incoming,
@@ -85,10 +85,10 @@ def add(
         elif result is not None:
             replace_files(result, {}, {"aligned": False})
     if as_json:
-        print_json(_added_json(added))
+        print_json(added_json(added))
     elif not quiet:
         print_warnings(incoming.warnings)
-        _tell_added(added, incoming, perf_counter() - started)
+        tell_added(added, incoming, perf_counter() - started)
     if added.session is None:
         print_warnings([f"refused, the map is unchanged: {added.decision.reason}"])
     return 0 if added.session is not None else 1
@@ -104,15 +104,6 @@ def _left_incomplete(store: MapStore, incoming: Incoming, result: Path | None) -
     return same[0] if same and same[0].digest == incoming.digest else None
 
 
-def _tell_completed(session: StoredSession, *, quiet: bool, as_json: bool) -> int:
-    if as_json:
-        print_json({"aligned": True, "plant": session.plant, "session": session.session, "was_in_map": True})
-    elif not quiet:
-        rows = [("session", f"{session.session} is in the map already; its result is complete now")]
-        print_columns("cluster-slam map add", (), rows)
-    return 0
-
-
 def _incoming(result: Path | None, landmarks: Path | None, date: str | None, session: str | None) -> Incoming:
     from cluster_slam.io.map.incoming import read_incoming, read_landmarks
     from cluster_slam.io.map.times import seconds
@@ -124,48 +115,3 @@ def _incoming(result: Path | None, landmarks: Path | None, date: str | None, ses
     if landmarks is not None and result is None:
         return read_landmarks(landmarks, time=None if date is None else seconds(date), session=session)
     raise ConfigError("expected either a RESULT folder or --landmarks FILE")
-
-
-def _added_json(added: Added) -> dict[str, object]:
-    if added.session is None:
-        return {"aligned": False, "reason": added.decision.reason, "refusal": added.decision.refusal.value}
-    from cluster_slam.geometry import tum_from_pose
-
-    return {
-        "aligned": True,
-        "plant": added.session.plant,
-        "session": added.session.session,
-        "probability": added.session.probability,
-        "T_map_world": tum_from_pose(added.session.T_map_world).tolist(),
-        "clusters": {"known": added.n_known, "new": added.n_new, "missed": added.n_missed},
-        "flowers": {"known": added.n_flowers_known, "new": added.n_flowers_new},
-    }
-
-
-def _tell_added(added: Added, incoming: Incoming, seconds: float) -> None:
-    if added.session is None:
-        return
-    rows = [
-        ("session", added.session.session),
-        ("plant", added.session.plant),
-        ("alignment", _alignment(added, incoming)),
-        ("clusters", f"{added.n_known} known again, {added.n_new} new, {added.n_missed} looked at and not seen"),
-        ("flowers", f"{added.n_flowers_known} known again, {added.n_flowers_new} new"),
-        ("time", f"{seconds:.1f} s"),
-    ]
-    print_columns("cluster-slam map add", (), rows)
-
-
-def _alignment(added: Added, incoming: Incoming) -> str:
-    """How sure the pose is, and how sure the plant's middle stands in the map."""
-    if not added.decision.matches or added.decision.accepted is None or added.session is None:
-        return "the first session of a plant makes its frame"
-    import numpy as np
-
-    from cluster_slam.geometry import skew
-
-    middle = added.session.scale * incoming.constellation.flowers.mean(axis=0)
-    lever = np.hstack([-skew(middle), np.eye(3)])
-    turn = np.degrees(np.sqrt(np.diag(added.session.cov)[:3].max()))
-    shift = 1e3 * np.sqrt(np.diag(lever @ added.session.cov @ lever.T).max())
-    return f"sure to {added.session.probability:.4f}; one sigma {turn:.2f} deg, {shift:.1f} mm at the plant's middle"

@@ -238,6 +238,8 @@ def refused(path: Path, error: sqlite3.Error) -> OutputError | InputError:
         return OutputError(f"{path}: another program is writing to it; nothing has changed, try again when it is done")
     if "full" in text:
         return OutputError(f"{path}: the disk is full; nothing has changed, make room and try again")
+    if "I/O" in text:  # also what SQLite says where no room is left for the index of its journal
+        return OutputError(f"{path}: cannot be written ({text}); nothing has changed, is the disk full?")
     if "readonly" in text or "unable to open" in text:
         return OutputError(f"{path}: cannot be written ({text}); nothing has changed")
     if "UNIQUE" in text:
