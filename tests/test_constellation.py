@@ -23,7 +23,7 @@ from cluster_slam.remember.decide import Refusal, decide
 from cluster_slam.remember.tables import aligned, empty_plant
 from cluster_slam.remember.update import update
 from cluster_slam.simulate.config import SimulateConfig
-from cluster_slam.simulate.season import SEASON, SeasonPlant
+from cluster_slam.simulate.season import HARD_SEASON, SEASON, SeasonPlant
 
 CONFIG = MapConfig()
 
@@ -178,6 +178,21 @@ def test_half_of_a_flat_scene_is_clutter() -> None:
     for points, is_known in ((np.concatenate([seen, others[:5]]), True), (others, False)):
         session = replace(session_of(transform(turn, points), np.arange(16), 8 * DAY_S, 0.008), viewpoint=view)
         assert (decide(session, [plant], CONFIG, similarity=True).accepted is not None) == is_known
+
+
+def test_few_in_common_are_searched_for_longer() -> None:
+    """16 of 46 flowers are known ones: no triple of the first look is of three of them."""
+    config = replace(HARD_SEASON, session=SimulateConfig(n_clusters=20))
+    plant = SeasonPlant(config, seed=6009)
+    plant.grow_to(0.0)
+    first = plant.rest()
+    plant.grow_to(1.0)
+    later = plant.rest()
+    decision = decide(later.constellation, [plant_of(first.constellation)], CONFIG)
+    assert decision.accepted is not None
+    assert decision.accepted.found is not None
+    T = inverse(first.T_map_world) @ later.T_map_world
+    assert np.abs(se3_log(inverse(T) @ decision.accepted.found.T_map_world)).max() < 0.02
 
 
 def lattice(seed: int, *, same: bool) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cluster_slam.constellation.similarity import Similarities, align, concatenate
+from cluster_slam.constellation.similarity import Similarities, align
 from cluster_slam.geometry import Array
 from cluster_slam.records import BoolArray, IntArray
 
@@ -35,18 +35,16 @@ def guess_poses(
     """Poses query -> known (h) from agreeing triples, or pairs where d = 2; at most ``max_poses``, evenly taken."""
     d = query.centres.shape[1]
     sides = _sides(known)
-    parts = []
+    first, second = [np.zeros((0, d), dtype=np.int64)], [np.zeros((0, d), dtype=np.int64)]
     for corner in _corners(query.centres, n_seeds, d):
         found = _agreeing(query, sides, corner, scale_range)
-        if len(found):
-            a = np.broadcast_to(query.centres[corner], (len(found), d, d))
-            parts.append(align(a, known.centres[found], scale_range))
-    if not parts:
-        return align(np.zeros((0, d, d)), np.zeros((0, d, d)), scale_range)
-    poses = concatenate(parts)
-    if len(poses) > max_poses:
-        poses = poses.take(np.linspace(0, len(poses) - 1, max_poses).astype(np.int64))
-    return poses
+        first.append(np.broadcast_to(corner, found.shape))
+        second.append(found)
+    a, b = np.concatenate(first), np.concatenate(second)
+    if len(a) > max_poses:
+        rows = np.linspace(0, len(a) - 1, max_poses).astype(np.int64)
+        a, b = a[rows], b[rows]
+    return align(query.centres[a], known.centres[b], scale_range)
 
 
 def _corners(centres: Array, n_seeds: int, d: int) -> IntArray:
@@ -83,11 +81,11 @@ def _evenly(corners: IntArray, worth: Array, n: int, n_seeds: int) -> IntArray:
     """The worthiest corners, such that no row is used much more often than the others."""
     order = np.argsort(-worth, kind="stable")
     limit = int(np.ceil(1.5 * corners.shape[1] * n_seeds / max(n, 1))) + 1
-    used = np.zeros(n, dtype=np.int64)
-    kept = []
-    for k in order[: 60 * n_seeds].tolist():
-        if (used[corners[k]] < limit).all():
-            used[corners[k]] += 1
+    used, kept = [0] * n, []
+    for k, corner in zip(order[: 60 * n_seeds].tolist(), corners[order[: 60 * n_seeds]].tolist(), strict=True):
+        if max(used[row] for row in corner) < limit:
+            for row in corner:
+                used[row] += 1
             kept.append(k)
             if len(kept) == n_seeds:
                 break

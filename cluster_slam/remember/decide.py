@@ -10,7 +10,8 @@ import numpy as np
 
 from cluster_slam.config import MapConfig
 from cluster_slam.constellation.growth import at
-from cluster_slam.constellation.match import Match, glance, match
+from cluster_slam.constellation.match import Match, match
+from cluster_slam.constellation.search import glance
 from cluster_slam.geometry import Array
 from cluster_slam.records import Constellation, PlantMap
 
@@ -91,7 +92,8 @@ def _other_hand(
     Three flowers are as good as their image: parts of a mirrored plant fit the plant itself.
     """
     mirrored = replace(session, flowers=session.flowers * [1.0, 1.0, -1.0])
-    image = match(mirrored, plant, config.match, config.growth, similarity=similarity)
+    quickly = replace(config.match, evidence=-np.inf)  # no deeper search
+    image = match(mirrored, plant, quickly, config.growth, similarity=similarity)
     if image.found is None or image.found.space.d < 3:
         return None
     if image.evidence < max(best.evidence, config.match.evidence) + config.match.margin:
