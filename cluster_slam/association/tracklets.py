@@ -126,40 +126,45 @@ class _Builder:
 
     def _step(self, k: int) -> None:
         """One frame of every lane."""
-        lane, pieces, cfg = np.flatnonzero(k < self.lanes.length), self.pieces, self.config
-        self._forget(k)
+        lane = np.flatnonzero(k < self.lanes.length)
         frame = self.lanes.at(k)[lane]
-        row = ranges(self.frames.starts[frame], np.diff(self.frames.starts)[frame])
-        at = np.repeat(np.arange(len(lane)), np.diff(self.frames.starts)[frame])
-        c, R = self.frames.points[row], self.T[frame, :3, :3]
-        S = rotate_cov(R[at], self.frames.covs[row])
-        w = transform(self.T[frame][at], c)
-        J = point_jacobian(R[at], c)
-        S_pose = S + J @ self.cov_pose[frame][at] @ np.swapaxes(J, -1, -2)
-        of = np.searchsorted(lane, pieces.lane)
-        var = cfg.gate_chi2 * np.trace(pieces.cov, axis1=1, axis2=2)
-        near = near_pairs(
-            pieces.position, var, of, w, cfg.gate_chi2 * np.trace(S_pose, axis1=1, axis2=2), at, len(lane)
-        )
-        rows, cols, _ = self._assign(near, w, S_pose, of)
-        old = pieces.age[rows] >= cfg.min_age
-        if old.any():
-            r, q = rows[old], cols[old]
-            residual, cov = pieces.position[r] - w[q], pieces.cov[r] + S[q]
-            z = solve_pose_corrections(R, at[q], c[q], residual, cov, self.prior_information[frame])
-            w = transform((self.T[frame] @ se3_exp(z))[at], c)
-        rows, cols, chi2 = self._assign(near, w, S, of)
+        starts = self.frames.starts
+        count = starts[frame + 1] - starts[frame]
+        row, at = ranges(starts[frame], count), np.repeat(np.arange(len(lane)), count)
+        self._forget(k)
+        S = rotate_cov(self.T[frame[at], :3, :3], self.frames.covs[row])
+        w, rows, cols, chi2 = self._matched(lane, frame, row, at, S)
         label = np.full(len(row), -1)
-        label[cols] = pieces.label[rows]
-        pieces.update(rows, w[cols], S[cols], frame[at[cols]])
+        label[cols] = self.pieces.label[rows]
+        self.pieces.update(rows, w[cols], S[cols], frame[at[cols]])
         fresh = np.flatnonzero(label < 0)
         label[fresh] = self.n_pieces + np.arange(len(fresh))
         self.n_pieces += len(fresh)
-        pieces.add(w[fresh], S[fresh], label[fresh], lane[at[fresh]], frame[at[fresh]])
+        self.pieces.add(w[fresh], S[fresh], label[fresh], lane[at[fresh]], frame[at[fresh]])
         counts = (k >= self.lanes.run_up[lane])[at]
         self.labels[row[counts]] = label[counts]
         self.innovation[row[cols][counts[cols]]] = chi2[counts[cols]]
         self.joints.append((row[~counts], label[~counts]))
+
+    def _matched(
+        self, lane: IntArray, frame: IntArray, row: IntArray, at: IntArray, S: Array
+    ) -> tuple[Array, IntArray, IntArray, Array]:
+        """Points (p, 3) of the lanes' frames with their poses corrected, and matches of pieces with them."""
+        pieces, cfg = self.pieces, self.config
+        c, R = self.frames.points[row], self.T[frame, :3, :3]
+        w = transform(self.T[frame][at], c)
+        J = point_jacobian(R[at], c)
+        S_pose = S + J @ self.cov_pose[frame][at] @ np.swapaxes(J, -1, -2)
+        of = np.searchsorted(lane, pieces.lane)
+        var, var_pose = (cfg.gate_chi2 * np.trace(cov, axis1=1, axis2=2) for cov in (pieces.cov, S_pose))
+        near = near_pairs(pieces.position, var, of, w, var_pose, at, len(lane))
+        rows, cols, _ = self._assign(near, w, S_pose, of)
+        old = pieces.age[rows] >= cfg.min_age
+        r, q = rows[old], cols[old]
+        residual, cov = pieces.position[r] - w[q], pieces.cov[r] + S[q]
+        z = solve_pose_corrections(R, at[q], c[q], residual, cov, self.prior_information[frame])
+        w = transform((self.T[frame] @ se3_exp(z))[at], c)
+        return w, *self._assign(near, w, S, of)
 
     def _forget(self, k: int) -> None:
         """Leave out the pieces that were not seen for too long, and let the others walk."""

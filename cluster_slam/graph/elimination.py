@@ -118,13 +118,13 @@ class _Elimination:
         step = int(np.clip(_CHUNK * links.n_frames // max(len(links.frame), 1), 1, _MOST_FRAMES))
         for first in range(0, links.n_frames, step):
             last = first + step
-            chunk = self._chunk(first, last)
             begun = np.flatnonzero((begin >= first) & (begin < last))
             alive = np.concatenate([carried.stretches, begun])
             ended = end[alive] < last
-            places = np.union1d(carried.places, self.links.landmark[chunk.observations])
+            q = slice(*np.searchsorted(links.frame, [first, last]).tolist())
+            places = np.union1d(carried.places, links.landmark[q])
             unknowns = Unknowns(alive[ended], alive[~ended], places, self.k + 1)
-            H = self._information(chunk, unknowns, begun)
+            H = self._information(_Chunk.of(links, first, last, begun, unknowns))
             carried.add_to(H, unknowns)
             front, carried, left = eliminate(H, unknowns)
             fronts.append(front)
@@ -132,68 +132,85 @@ class _Elimination:
             S[np.ix_(where, where)] += left
         return S, fronts
 
-    def _chunk(self, first: int, last: int) -> _Chunk:
-        """Frames first..last-1 with all that belongs to them."""
-        links = self.links
-        p0, p1 = np.searchsorted(links.pair_frame, [first, last])
-        q0, q1 = np.searchsorted(links.frame, [first, last])
-        return _Chunk(slice(first, min(last, links.n_frames)), slice(int(p0), int(p1)), slice(int(q0), int(q1)))
-
-    def _information(self, chunk: _Chunk, unknowns: Unknowns, begun: IntArray) -> Array:
+    def _information(self, chunk: _Chunk) -> Array:
         """Of stretches, places, hand-eye and vector, from one chunk of frames, poses and displacements eliminated."""
-        links, at = self.links, self.at
-        q, p, f = chunk.observations, chunk.pairs, chunk.frames
-        with_b = p.start + np.flatnonzero(links.stretch[p] >= 0)
-        j, b = unknowns.of_places(links.landmark[q]), unknowns.of_stretches(links.stretch[with_b])
-        new = unknowns.of_stretches(begun)
-        n, size = f.stop - f.start, unknowns.n_blocks
-        cell = np.concatenate([(links.frame[q] - f.start) * size + j, (links.pair_frame[with_b] - f.start) * size + b])
-        rows = sums(np.concatenate([self.z_by_place[q], self.z_by_b[with_b]]), cell, n * size)
-        rows = rows.reshape(n, size, 6, 3).transpose(0, 2, 1, 3).reshape(6 * n, 3 * size)
-        rows = np.hstack([rows, self.z_by_x[f].reshape(6 * n, self.k), self.z_vector[f].reshape(6 * n, 1)])
+        rows, n = self._rows(chunk), 3 * chunk.n_blocks
         H = -rows.T @ rows
-        # Displacements tie the flowers of one frame and cluster together, and their stretch with them.
-        one, other = pairs_in_lanes(links.pair[q] - p.start, links.pair[q] - p.start, p.stop - p.start)
-        row, seen = j[one], self.d_by_place[q]
-        info = at.d_information[with_b, None, None]
-        of_pair = unknowns.of_stretches(links.stretch[links.pair[q]])
-        tied = np.flatnonzero(links.stretch[links.pair[q]] >= 0)
-        across = at.d_information[links.pair[q][tied], None, None] * seen[tied]
-        blocks = [
-            (j, j, self.M[q]),
-            (row, j[other], -self.M[q][one] @ seen[other]),
-            (of_pair[tied], j[tied], across),
-            (j[tied], of_pair[tied], np.swapaxes(across, 1, 2)),
-            (b, b, info * np.eye(3) - info**2 * self.d_cov[with_b]),
-            (new, new, at.b_information[begun, None, None] * np.eye(3)),
-        ]
-        table = sums(
-            np.concatenate([block for _, _, block in blocks]),
-            np.concatenate([row * size + column for row, column, _ in blocks]),
-            size * size,
-        )
-        H[: 3 * size, : 3 * size] += table.reshape(size, size, 3, 3).transpose(0, 2, 1, 3).reshape(3 * size, 3 * size)
-        vector = sums(
-            np.concatenate(
-                [
-                    _times(np.swapaxes(at.A_l[q], 1, 2), at.r[q]) - _times(self.M[q], self.d_mean[links.pair[q]]),
-                    at.d_information[with_b, None] * (at.d[with_b] + self.d_mean[with_b]),
-                    -at.b_information[begun, None] * at.b[begun],
-                ]
-            ),
-            np.concatenate([j, b, new]),
-            size,
-        ).ravel()
-        H[: 3 * size, -1] += vector
-        H[-1, : 3 * size] += vector
+        H[:n, :n] += self._blocks(chunk)
+        vector = self._vector(chunk)
+        H[:n, -1] += vector
+        H[-1, :n] += vector
         return H
 
+    def _rows(self, chunk: _Chunk) -> Array:
+        """Of the poses: the square root of what they take away."""
+        links, q, p, f = self.links, chunk.observations, chunk.pairs, chunk.frames
+        n, size = f.stop - f.start, chunk.n_blocks
+        row = np.concatenate([links.frame[q], links.pair_frame[p]]) - f.start
+        column = np.concatenate([chunk.place, chunk.stretch])
+        table = sums(np.concatenate([self.z_by_place[q], self.z_by_b[p]]), row * size + column, n * size)
+        table = table.reshape(n, size, 6, 3).transpose(0, 2, 1, 3).reshape(6 * n, 3 * size)
+        return np.hstack([table, self.z_by_x[f].reshape(6 * n, self.k), self.z_vector[f].reshape(6 * n, 1)])
 
-@dataclass(frozen=True, slots=True)
+    def _blocks(self, chunk: _Chunk) -> Array:
+        """Of stretches and places: displacements tie the flowers of a frame and cluster together, and their stretch."""
+        links, at, q, p, size = self.links, self.at, chunk.observations, chunk.pairs, chunk.n_blocks
+        pair = links.pair[q]
+        one, other = pairs_in_lanes(pair - pair[:1], pair - pair[:1], int(np.ptp(pair)) + 1 if len(pair) else 0)
+        tied = np.flatnonzero(links.stretch[pair] >= 0)
+        b, j = chunk.stretch[np.searchsorted(p, pair[tied])], chunk.place[tied]
+        across = at.d_information[pair[tied], None, None] * self.d_by_place[q][tied]
+        weight = at.d_information[p, None, None]
+        blocks = [
+            (chunk.place, chunk.place, self.M[q]),
+            (chunk.place[one], chunk.place[other], -self.M[q][one] @ self.d_by_place[q][other]),
+            (b, j, across),
+            (j, b, np.swapaxes(across, 1, 2)),
+            (chunk.stretch, chunk.stretch, weight * np.eye(3) - weight**2 * self.d_cov[p]),
+            (chunk.new, chunk.new, at.b_information[chunk.begun, None, None] * np.eye(3)),
+        ]
+        cell = np.concatenate([row * size + column for row, column, _ in blocks])
+        table = sums(np.concatenate([block for _, _, block in blocks]), cell, size * size)
+        return table.reshape(size, size, 3, 3).transpose(0, 2, 1, 3).reshape(3 * size, 3 * size)
+
+    def _vector(self, chunk: _Chunk) -> Array:
+        at, q, p, begun = self.at, chunk.observations, chunk.pairs, chunk.begun
+        of_places = _times(np.swapaxes(at.A_l[q], 1, 2), at.r[q])
+        of_places -= _times(self.M[q], self.d_mean[self.links.pair[q]])
+        of_stretches = at.d_information[p, None] * (at.d[p] + self.d_mean[p])
+        values = np.concatenate([of_places, of_stretches, -at.b_information[begun, None] * at.b[begun]])
+        return sums(values, np.concatenate([chunk.place, chunk.stretch, chunk.new]), chunk.n_blocks).ravel()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Chunk:
+    """Some frames with what belongs to them, and in which block of three columns of their front that is."""
+
     frames: slice
-    pairs: slice
     observations: slice
+    pairs: IntArray  # (p,) those that are in a stretch
+    begun: IntArray  # (s,) stretches that begin here
+    n_blocks: int
+    place: IntArray  # block of each observation's place
+    stretch: IntArray  # (p,) block of each pair's stretch
+    new: IntArray  # (s,) block of each that begins
+
+    @classmethod
+    def of(cls, links: Links, first: int, last: int, begun: IntArray, unknowns: Unknowns) -> _Chunk:
+        """Frames first..last-1."""
+        p0, p1 = np.searchsorted(links.pair_frame, [first, last])
+        q = slice(*np.searchsorted(links.frame, [first, last]).tolist())
+        pairs = p0 + np.flatnonzero(links.stretch[p0:p1] >= 0)
+        return cls(
+            frames=slice(first, min(last, links.n_frames)),
+            observations=q,
+            pairs=pairs,
+            begun=begun,
+            n_blocks=unknowns.n_blocks,
+            place=unknowns.of_places(links.landmark[q]),
+            stretch=unknowns.of_stretches(links.stretch[pairs]),
+            new=unknowns.of_stretches(begun),
+        )
 
 
 def _times(A: Array, v: Array) -> Array:

@@ -36,12 +36,10 @@ class Unknowns:
         return len(self.ended) + len(self.later) + np.searchsorted(self.places, places)
 
     def of_stretches(self, stretches: IntArray) -> IntArray:
-        """Blocks of stretches; of one that is not among them, any."""
+        """Blocks of stretches, which must be among them."""
         alive = np.concatenate([self.ended, self.later])
-        if len(alive) == 0:
-            return np.zeros(len(stretches), dtype=np.int64)
         order = np.argsort(alive)
-        return order[np.minimum(np.searchsorted(alive[order], stretches), len(alive) - 1)]
+        return order[np.searchsorted(alive[order], stretches)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
