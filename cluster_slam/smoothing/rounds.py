@@ -28,7 +28,7 @@ from cluster_slam.graph.variance import errs_slowly
 from cluster_slam.grouping import Motion, group_flowers
 from cluster_slam.records import BoolArray
 from cluster_slam.smoothing.displaced import Displaced, taken_by_poses
-from cluster_slam.smoothing.stretches import at_rest, standing_still, stretches
+from cluster_slam.smoothing.stretches import at_rest, beyond_rest, standing_still, stretches
 from cluster_slam.smoothing.world import NO_WEIGHT, World, fewest_observations, scalar_var
 from tracking.gating import chi2_threshold
 
@@ -101,8 +101,11 @@ def problem(
     if alone:
         scale = np.zeros_like(scale)  # flowers that stand alone tell no sway from errors of their own
     moved = Displaced(d, cov, share, scale, frame, cluster, frames.stamps)
-    rest, lasting_s = (standing_still(cov), 0.0) if alone else at_rest(moved)
-    sigma = np.hypot(scale, rest)
+    rest, lasting_s = standing_still(cov), 0.0
+    if not alone:
+        moved = beyond_rest(moved)
+        rest, lasting_s = at_rest(moved)
+    sigma = np.hypot(moved.scale, rest)
     stretch, stretch_sigma = np.full(len(frame), -1), np.empty(0)
     if in_stretches and not alone and len(frame):
         stretch, stretch_sigma, sigma = stretches(moved, rest, lasting_s)
@@ -111,7 +114,7 @@ def problem(
         T=world.T,
         X=world.X,
         places=world.places,
-        d=np.where(scale[:, None] > 0, d, 0.0),
+        d=np.where(moved.scale[:, None] > 0, d, 0.0),
         weight=(world.landmark >= 0).astype(float),
         residual_chi2=np.full(len(frames), np.nan),
     )

@@ -10,6 +10,8 @@ half a second are ten times the error of that many measurements. Its stretches a
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
@@ -21,7 +23,8 @@ _LAGS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 21, 26, 34, 42, 55, 68, 89, 110, 144)
 _WITHIN = 0.8  # of a stretch's sigma: a quarter of a sine ends 0.9 of its own rms from its mean
 _CALM_SHARE = 0.1  # of the measurement's sigma: no cluster is known to stand stiller
 _MISTAKE_CHI2 = 16.0  # of a displacement at rest beyond which it is taken for a mistake
-_LOST = 0.1  # correlation that is none any more
+_BEYOND = 3.0  # times the sigma at rest: motion that rest does not explain
+_FADING = np.geomspace(0.001, 0.25, 25)  # of the time that clusters were seen: how soon motion at rest is another
 
 
 def standing_still(cov: Array) -> float:
@@ -40,26 +43,34 @@ def at_rest(moved: Displaced) -> tuple[float, float]:
     # Squares of rare mistakes would be all that is seen.
     usual = calm & ((moved.d**2).sum(axis=1) <= _MISTAKE_CHI2 * 3.0 * moved.noise)
     series = Series(moved, usual, 1.0 / moved.noise)
-    (first, n_first), (second, n_second) = series.own_covariance(1), series.own_covariance(2)
-    if n_first + n_second < FEWEST:
-        return least, series.dt
-    shared = (first * n_first + second * n_second) / (n_first + n_second)
-    if shared <= least**2:
-        return least, series.dt
-    return float(np.sqrt(shared)), _lasting(series, shared)
+    return _fading(series, least)
 
 
-def _lasting(series: Series, square: float) -> float:
-    """Integral over time, s, of the correlation of displacements with mean ``square``, until it is lost."""
-    total, last_lag, last = 1.0, 0, 1.0
-    for lag in _LAGS:
-        value, count = series.own_covariance(lag)
-        if count < FEWEST or value < _LOST * square:
-            break
-        now = min(value / square, last)
-        total += 2.0 * (now + (lag - last_lag - 1) * 0.5 * (now + last))
-        last_lag, last = lag, now
-    return total * series.dt
+def beyond_rest(moved: Displaced) -> Displaced:
+    """The same, in motion only what is farther off than clusters at rest are: what they do lasts, and looks like it."""
+    rest, _ = at_rest(moved)
+    return replace(moved, scale=np.where(moved.scale > _BEYOND * rest, moved.scale, 0.0))
+
+
+def _fading(series: Series, least: float) -> tuple[float, float]:
+    """Sigma, m, and integral of the correlation, s, of the exponential that covariances over time are closest to.
+
+    Places are means over the time that a cluster was seen, and have taken that part of the motion with them.
+    """
+    found = np.array([series.own_covariance(lag) for lag in _LAGS])
+    value, count = found[found[:, 1] >= FEWEST].T
+    lags = np.array(_LAGS)[: len(value)]
+    if len(value) < 2:
+        return least, series.dt
+    usual = float((series.weight > 0).sum(axis=0).max())
+    tau = _FADING * usual
+    shape = np.exp(-lags / tau[:, None]) - np.minimum(2.0 * tau[:, None] / usual, 0.5)
+    square = (shape * count) @ value / np.maximum((shape**2) @ count, 1e-30)
+    misfit = ((value - square[:, None] * shape) ** 2) @ count
+    best = int(misfit.argmin())
+    if square[best] <= least**2:
+        return least, series.dt
+    return float(np.sqrt(square[best])), float(max(2.0 * tau[best], 1.0) * series.dt)
 
 
 def quarter_period(moved: Displaced) -> float:
