@@ -23,7 +23,8 @@ _LAGS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 21, 26, 34, 42, 55, 68, 89, 110, 144)
 _WITHIN = 0.8  # of a stretch's sigma: a quarter of a sine ends 0.9 of its own rms from its mean
 _CALM_SHARE = 0.1  # of the measurement's sigma: no cluster is known to stand stiller
 _MISTAKE_CHI2 = 16.0  # of a displacement at rest beyond which it is taken for a mistake
-_BEYOND = 3.0  # times the sigma at rest: motion that rest does not explain
+_BEYOND = 2.0  # times the sigma at rest: motion that rest does not explain
+_SOONEST = 2.0  # frames in which motion fades at the soonest: what is faster cannot be told from noise
 _FADING = np.geomspace(0.001, 0.25, 25)  # of the time that clusters were seen: how soon motion at rest is another
 
 
@@ -49,7 +50,8 @@ def at_rest(moved: Displaced) -> tuple[float, float]:
 def beyond_rest(moved: Displaced) -> Displaced:
     """The same, in motion only what is farther off than clusters at rest are: what they do lasts, and looks like it."""
     rest, _ = at_rest(moved)
-    return replace(moved, scale=np.where(moved.scale > _BEYOND * rest, moved.scale, 0.0))
+    noise = float(np.sqrt(np.median(moved.noise))) if len(moved.noise) else 0.0  # what exceeds it needs no such care
+    return replace(moved, scale=np.where(moved.scale > min(_BEYOND * rest, noise), moved.scale, 0.0))
 
 
 def _fading(series: Series, least: float) -> tuple[float, float]:
@@ -63,7 +65,7 @@ def _fading(series: Series, least: float) -> tuple[float, float]:
     if len(value) < 2:
         return least, series.dt
     usual = float((series.weight > 0).sum(axis=0).max())
-    tau = _FADING * usual
+    tau = np.maximum(_FADING * usual, _SOONEST)
     shape = np.exp(-lags / tau[:, None]) - np.minimum(2.0 * tau[:, None] / usual, 0.5)
     square = (shape * count) @ value / np.maximum((shape**2) @ count, 1e-30)
     misfit = ((value - square[:, None] * shape) ** 2) @ count
