@@ -131,3 +131,9 @@ def test_the_command_writes_a_result(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert {p.name for p in out.iterdir()} >= {"trajectory.txt", "observations.csv", "drift.csv", "report.html"}
     assert not (tmp_path / "out.tracking").exists()
     assert run(["evaluate", str(out), str(session), "--quiet"]) == 0
+
+
+def test_what_drifts_is_said_to_drift() -> None:
+    world = simulate_session(replace(PRESETS["moderate-odometry"], duration_s=3.0, fps=15.0), seed=6)
+    assert any("poses drift" in text for text in track(world.session).warnings)
+    assert not any("poses drift" in text for text in tracked().warnings)

@@ -13,6 +13,11 @@ from cluster_slam.online.journal import Told
 from cluster_slam.online.tracker import OnlineTracker
 from cluster_slam.records import Calibration, Clusters, Diagnostics, Drift, Flowers, IntArray, Result, Session, State
 
+_DRIFTING = (
+    "poses drift: what odometry errs over the whole way is not in the covariances of places and poses, and no way back to "
+    "a place is closed; smoothing the session does both"
+)
+
 
 def make_result(session: Session, tracker: OnlineTracker, told: Told, timings: dict[str, float]) -> Result:
     """The result of a session all of whose frames have been told.
@@ -27,7 +32,8 @@ def make_result(session: Session, tracker: OnlineTracker, told: Told, timings: d
     reasons[order], nis[order] = told.rows["reason"], told.rows["nis"]
     flowers, clusters = _tables(session, tracker, flower_ids)
     poor = _shortcomings(flower_ids, len(flowers))
-    warnings = (*session.warnings, *poor, *(text.partition(" ")[2] for text in told.warnings))
+    drifting = (_DRIFTING,) if session.pose_error == "odometry" else ()
+    warnings = (*session.warnings, *poor, *drifting, *(text.partition(" ")[2] for text in told.warnings))
     return Result(
         session=session,
         T_world_camera=pose_from_tum(told.frames["pose"].astype(np.float64)),
