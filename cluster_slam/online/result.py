@@ -14,8 +14,8 @@ from cluster_slam.online.tracker import OnlineTracker
 from cluster_slam.records import Calibration, Clusters, Diagnostics, Drift, Flowers, IntArray, Result, Session, State
 
 _DRIFTING = (
-    "poses drift: what odometry errs over the whole way is not in the covariances of places and poses, and where the way "
-    "comes back to a place nothing is corrected; smoothing the session does both"
+    "poses drift: what odometry errs over the whole way is not in the covariances of places and poses, and where "
+    "the way comes back to a place nothing is corrected; smoothing the session does both"
 )
 
 
