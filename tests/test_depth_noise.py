@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cluster_slam.association.depth_noise import at_expected_depth, powers_of_depth
 from cluster_slam.association.frames import Frames, sort_by_frame
 from cluster_slam.geometry import Array
 from cluster_slam.records import Observations
-from cluster_slam.smoothing.depth_noise import at_expected_depth, powers_of_depth
 
 
 def _seen(depth: Array, power: float, seed: int = 0) -> tuple[Frames, Array]:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cluster_slam.geometry import Array, se3_exp, skew, transform
+from cluster_slam.geometry import Array, inverse, se3_exp, skew, transform
 from cluster_slam.localisation import sway
 from cluster_slam.localisation.landmarks import Landmarks
-from cluster_slam.localisation.scene import ErrorScale, Look
+from cluster_slam.localisation.scene import ErrorScale, Look, covs_at
 from cluster_slam.records import IntArray
 from tracking.assignment import assign
 from tracking.gating import mahalanobis_sq, matching_log_likelihood
@@ -102,6 +102,7 @@ def solve(
     clusters, group = np.unique(marks.cluster[flowers], return_inverse=True)
     n = len(clusters)
     points, places = look.points[rows], marks.positions[flowers]
+    covs = covs_at(look, rows, transform(inverse(T), places)[:, 2], scale)
     shared = marks.shared_covs[clusters] + scale.sway_m**2 * np.eye(3)
     offsets, tie = np.zeros((n, 3)), _inverse(shared)
     swinging, cost = np.zeros(n), 0.0
@@ -109,7 +110,7 @@ def solve(
     moved = np.zeros(6)
     for _ in range(n_iterations):
         R = T[:3, :3]
-        V = R @ look.covs[rows] @ R.T + marks.covs[flowers]
+        V = R @ covs @ R.T + marks.covs[flowers]
         r = places - transform(T, points)
         J = point_jacobian(R, points)
         weighted = np.linalg.solve(V, np.concatenate([J, r[..., None], np.broadcast_to(np.eye(3), V.shape)], axis=-1))

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cluster_slam.association.depth_noise import stretched
 from cluster_slam.errors import InputError
 from cluster_slam.geometry import Array
+from cluster_slam.records import IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +23,7 @@ class ErrorScale:
     detection: float = 0.8  # probability that a flower in view is detected
     unmapped: float = 0.2  # share of the points that the map does not have: false ones, new flowers
     pose_variance: float = 1.0  # times the stated covariances of the given poses or steps
+    depth_powers: tuple[float, float] = (0.0, 0.0)  # with which stated sigmas grow with depth, along the ray and across
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,3 +59,15 @@ def make_look(points: Array, covs: Array, scale: ErrorScale) -> Look:
         k = int(smallest.argmin())
         raise InputError(f"the covariance of point {k} is not positive definite (eigenvalue {smallest[k]:.3g})")
     return Look(points, covs, np.sqrt(covs.trace(axis1=1, axis2=2) / 3.0))
+
+
+def covs_at(look: Look, rows: IntArray, depth: Array, scale: ErrorScale) -> Array:
+    """Covariances (m, 3, 3) of points ``rows`` as stated for the depths (m,) where their flowers are expected, m.
+
+    At the depth that was measured, points that came out too near would count for more than those too far.
+    """
+    covs = look.covs[rows]
+    ahead = (look.points[rows, 2] > 0) & (depth > 0)
+    if scale.depth_powers == (0.0, 0.0) or not ahead.all():
+        return covs
+    return stretched(look.points[rows], covs, depth, scale.depth_powers)

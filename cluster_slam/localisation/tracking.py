@@ -17,7 +17,7 @@ from cluster_slam.localisation import sway
 from cluster_slam.localisation.fit import GATE_CHI2, LOG_2PI
 from cluster_slam.localisation.landmarks import Landmarks
 from cluster_slam.localisation.motion import Motion
-from cluster_slam.localisation.scene import ErrorScale, Look
+from cluster_slam.localisation.scene import ErrorScale, Look, covs_at
 from cluster_slam.records import IntArray
 from tracking.assignment import assign
 from tracking.gating import mahalanobis_sq
@@ -265,7 +265,8 @@ class Track:
         H[k, axis, at[:, None, None] + np.arange(3)] = Rt
         H[k, axis, at[:, None, None] + 3 + np.arange(3)] = Rt
         V = np.zeros((m, 3, m, 3))
-        V[np.arange(m), :, np.arange(m)] = look.covs[rows] + Rt @ self.marks.covs[flowers] @ Rt.T
+        covs = covs_at(look, rows, h[:, 2], self.scale)
+        V[np.arange(m), :, np.arange(m)] = covs + Rt @ self.marks.covs[flowers] @ Rt.T
         return H.reshape(3 * m, -1), (look.points[rows] - h).ravel(), V.reshape(3 * m, 3 * m)
 
     def _move(self, T: Array, W: Array | None, X: Array | None, d: Array, moved: Array) -> None:

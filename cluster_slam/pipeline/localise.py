@@ -9,6 +9,8 @@ from time import perf_counter
 
 import numpy as np
 
+from cluster_slam.association.depth_noise import powers_of_depth
+from cluster_slam.association.frames import sort_by_frame
 from cluster_slam.config import LocaliseConfig
 from cluster_slam.geometry import Array, inverse, se3_exp, se3_log
 from cluster_slam.localisation import Landmarks, Localisation, Localiser
@@ -102,7 +104,8 @@ class _Frames:
     def __init__(self, session: Session, localiser: Localiser) -> None:
         self.session, self.localiser = session, localiser
         self.rows = _rows_of_frames(session)
-        self.scale = localiser.errors
+        ordered = sort_by_frame(session.observations, session.stamps)
+        self.scale = replace(localiser.errors, depth_powers=powers_of_depth(ordered))
         self.motion: Motion | None = None  # where frames may be taken together
         self._found: dict[int, Localisation] = {}
         self._plant: int | None = None  # that was seen last

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cluster_slam.association.calibration import Calibration, delayed
+from cluster_slam.association.depth_noise import at_expected_depth
 from cluster_slam.association.frames import Frames
 from cluster_slam.config import SmoothConfig
 from cluster_slam.geometry import Array
@@ -14,7 +15,6 @@ from cluster_slam.graph.batch import BatchSmoother, Estimate, Marginals
 from cluster_slam.graph.poses import PoseModel
 from cluster_slam.graph.variance import VarianceFactors, variance_factors
 from cluster_slam.records import IntArray, StatedNoise
-from cluster_slam.smoothing.depth_noise import at_expected_depth
 
 NO_WEIGHT = 1e6  # observations that must not bend the trajectory count as one in so many
 _FEW_FRAMES = 8  # fewer confirm nothing

@@ -26,14 +26,20 @@ def at_expected_depth(frames: Frames, depth: Array) -> Frames:
     known = np.isfinite(depth) & (frames.points[:, 2] > 0)
     if (along == 0.0 and across == 0.0) or not known.any():
         return frames
-    points = frames.points[known]
-    ratio = np.clip(depth[known] / points[:, 2], 1.0 / _FARTHEST, _FARTHEST)
+    covs = frames.covs.copy()
+    covs[known] = stretched(frames.points[known], covs[known], depth[known], (along, across))
+    return replace(frames, covs=covs)
+
+
+def stretched(points: Array, covs: Array, depth: Array, powers: tuple[float, float]) -> Array:
+    """Covariances (m, 3, 3) as they would be stated at ``depth`` (m,) m of points (m, 3) ahead, with these powers."""
+    along, across = powers
+    ratio = np.clip(depth / points[:, 2], 1.0 / _FARTHEST, _FARTHEST)
     u = points / np.linalg.norm(points, axis=1)[:, None]
     stretch = (ratio**across)[:, None, None] * np.eye(3)
     stretch = stretch + (ratio**along - ratio**across)[:, None, None] * u[:, :, None] * u[:, None]
-    covs = frames.covs.copy()
-    covs[known] = stretch @ covs[known] @ stretch
-    return replace(frames, covs=covs)
+    out: Array = stretch @ covs @ stretch
+    return out
 
 
 def powers_of_depth(frames: Frames) -> tuple[float, float]:
