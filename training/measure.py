@@ -37,6 +37,8 @@ def main() -> None:
     options.add_argument("--coco", type=Path)
     options.add_argument("--category", default="flower")
     options.add_argument("--calibrate", action="store_true")
+    options.add_argument("--seen", type=float, default=SEEN, help="least share of a wanted flower that is seen")
+    options.add_argument("--shorter", type=float, default=0.0, help="least shorter side of a wanted flower, px")
     options.add_argument("--at", type=float, default=0.5, help="score at which groups of flowers are counted")
     chosen = options.parse_args()
     is_file = chosen.model.endswith(".onnx")
@@ -44,9 +46,9 @@ def main() -> None:
     if chosen.coco is not None:
         tables = annotated(detector, chosen.coco, chosen.category)
     else:
-        tables = rendered(detector, range(chosen.first, chosen.first + chosen.worlds), chosen.usual)
+        tables = rendered(detector, range(chosen.first, chosen.first + chosen.worlds), chosen)
     scores, hits, errors, flowers = (np.concatenate([table[i] for table in tables]) for i in range(4))
-    report(scores, hits, int(flowers[:, 0].sum()))
+    report(scores, hits, int(flowers[:, 0].sum()), chosen.at)
     if chosen.coco is None:
         by_group(flowers, chosen.at)
     if len(errors):
@@ -57,16 +59,16 @@ def main() -> None:
             state(Path(chosen.model), {"sigma_px": f"{a:.3f} {b:.4f}", "pixel_origin": "centre"})
 
 
-def rendered(detector: object, seeds: range, usual: bool) -> list[tuple]:
+def rendered(detector: object, seeds: range, chosen: argparse.Namespace) -> list[tuple]:
     """Matches in the pictures of held-out worlds."""
     tables = []
     for seed in seeds:
-        for picture in usual_world(seed) if usual else render_world(seed):
+        for picture in usual_world(seed) if chosen.usual else render_world(seed):
             b = picture.boxes
             is_big = b.sizes.max(1) >= _MIN_PX
             height, width = picture.colour.shape[:2]
             inside = (b.centres > 3).all(1) & (b.centres < [width - 4, height - 4]).all(1)
-            wanted = (b.visible >= SEEN) & is_big & inside
+            wanted = (b.visible >= chosen.seen) & (b.sizes.min(1) >= chosen.shorter) & is_big & inside
             known = b.visible >= HIDDEN
             found = detector.detect(picture.colour)
             tables.append(matched(found, np.column_stack([b.centres, b.sizes]), wanted, known & ~wanted, b.visible))
@@ -150,13 +152,13 @@ def iou(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     return shared / (box[2:].prod() + boxes[:, 2:].prod(1) - shared + 1e-9)
 
 
-def report(scores: np.ndarray, hits: np.ndarray, n_wanted: int) -> None:
+def report(scores: np.ndarray, hits: np.ndarray, n_wanted: int, at: float) -> None:
     """Precision and recall over the least score."""
     order = np.argsort(-scores, kind="stable")
     true = np.cumsum(hits[order])
     recall, precision = true / max(n_wanted, 1), true / np.arange(1, len(true) + 1)
     print(f"{n_wanted} flowers, {len(scores)} boxes")
-    for least in (0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6):
+    for least in sorted({0.2, 0.3, 0.4, 0.5, 0.6, at}):
         k = int((scores >= least).sum()) - 1
         if k >= 0:
             print(f"score {least:.2f}: precision {precision[k]:.3f}, recall {recall[k]:.3f}")
