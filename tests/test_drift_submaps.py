@@ -90,6 +90,23 @@ def test_sound_instruments_are_left_alone() -> None:
     assert calibrate(frames, T, ParticleConfig(calibrate=False)) == Calibration()
 
 
+def test_poses_that_jitter_are_no_late_clock() -> None:
+    """Between two poses noise is less than in each: half a step's delay would look better, either way."""
+    frames, T, _ = _drive(3)
+    rng = np.random.default_rng(5)
+    noisy = T @ se3_exp(np.array([0, 0.01, 0, 0.03, 0, 0.03]) * rng.standard_normal((len(T), 6)))
+    assert calibrate(frames, noisy, ParticleConfig()).lag_s == 0.0
+
+
+def test_what_only_a_part_of_the_session_says_is_not_believed() -> None:
+    """Points that lie too near off the axis, and later too far, as where things moved: no instrument errs so."""
+    frames, T, _ = _drive(1)
+    cosine = frames.points[:, 2] / np.linalg.norm(frames.points, axis=1)
+    power = np.where(frames.frame < 0.55 * frames.n_frames, 1.0, -0.5)
+    found = calibrate(replace(frames, points=frames.points * (cosine**power)[:, None]), T, ParticleConfig())
+    assert found.power == 0.0
+
+
 def test_pieces_are_pure_and_pairs_lie_within_the_span() -> None:
     frames, T, label = _drive(3)
     piece = follow_points(frames, T, 1.0)

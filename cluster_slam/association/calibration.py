@@ -30,7 +30,8 @@ _PATIENCE = 5.0  # usual steps for which a piece waits for its next point
 _SPAN = 20.0  # usual steps between the points that are compared
 _LAG_STEPS = 3.0  # usual steps by which clocks may differ
 _MAX_POWER = 2.0  # of the cosine
-_LEAST_GAIN = 10.0  # log-likelihood that a correction must bring
+_LEAST_GAIN = 10.0  # log-likelihood that a correction must bring ...
+_N_BLOCKS, _CONTRADICTION = 10, 0.25  # ... and parts of the session may lose so much of what the others gain
 _FEWEST_PAIRS, _MOST_PAIRS = 100, 20_000
 _SLOW = 2.0  # errors that repeat within a piece are so much larger than those that do not
 _N_ROUNDS = 3
@@ -104,33 +105,50 @@ def calibrate(frames: Frames, given: Array, config: ParticleConfig) -> Calibrati
         a, b = pairs_of(frames, piece, _SPAN * usual)
         if len(a) < _FEWEST_PAIRS:
             return Calibration()
+        blocks = np.array_split(np.argsort(a, kind="stable"), _N_BLOCKS)
         n = len(np.unique(np.concatenate([a, b])))
 
-        def along(power: float, now: Calibration = now, a: IntArray = a, b: IntArray = b) -> float:
-            return float(np.abs(_errors(frames, given, replace(now, power=power), a, b)[0]).mean())
+        def along(power: float, now: Calibration = now, a: IntArray = a, b: IntArray = b) -> Array:
+            return np.abs(_errors(frames, given, replace(now, power=power), a, b)[0])
 
-        power = _believed(along, _MAX_POWER, n)
+        power = _believed(along, _MAX_POWER, n, blocks)
         now = replace(now, power=power)
 
-        def across(lag: float, now: Calibration = now, a: IntArray = a, b: IntArray = b) -> float:
-            return float(_errors(frames, given, replace(now, lag_s=lag), a, b)[1].mean())
+        def across(lag: float, now: Calibration = now, a: IntArray = a, b: IntArray = b) -> Array:
+            return _errors(frames, given, replace(now, lag_s=lag), a, b)[1]
 
-        now = replace(now, lag_s=_believed(across, _LAG_STEPS * usual, n))
+        now = replace(now, lag_s=_believed(across, _LAG_STEPS * usual, n, blocks, mirrored=True))
         found = _with_noise_left(frames, given, now, a, b) if power else now
     return replace(found, scale_sigma=abs(float(np.log(found._stretch(frames)).mean())))
 
 
-def _believed(error: Callable[[float], float], limit: float, n: int) -> float:
-    """Where the mean absolute error is least, if that is likelier than zero by ``_LEAST_GAIN`` (n Laplace errors)."""
+def _believed(
+    errors: Callable[[float], Array], limit: float, n: int, blocks: list[IntArray], *, mirrored: bool = False
+) -> float:
+    """Where the mean of absolute errors (k,) is least, if the session insists on it; else zero.
+
+    It must be likelier than nothing by ``_LEAST_GAIN`` (n Laplace errors), and so in all parts of the session: what
+    an instrument does wrong it does all the time, while flowers that sway, or impure pieces, look like anything.
+    ``mirrored``: nothing is what the opposite correction gives, as it smooths noise just as much (poses between two
+    poses are less noisy than both).
+    """
+
+    def mean(x: float) -> float:
+        return float(errors(x).mean())
+
     grid = np.linspace(-limit, limit, 25)
-    values = [error(float(x)) for x in grid]
-    k = int(np.argmin(values))
+    k = int(np.argmin([mean(float(x)) for x in grid]))
     step = grid[1] - grid[0]
     if k in (0, len(grid) - 1):
         return 0.0  # no error of this kind: something else that it would hide
-    best = minimize_scalar(error, bounds=(grid[k] - step, grid[k] + step), method="bounded", options={"xatol": 1e-3})
-    gain = n * np.log(max(error(0.0), 1e-300) / max(float(best.fun), 1e-300))
-    return float(best.x) if gain > _LEAST_GAIN else 0.0
+    best = minimize_scalar(mean, bounds=(grid[k] - step, grid[k] + step), method="bounded", options={"xatol": 1e-3})
+    nothing = errors(-float(best.x) if mirrored else 0.0)
+    gain = 0.5 if mirrored else 1.0
+    gain *= n * float(np.log(max(nothing.mean(), 1e-300) / max(float(best.fun), 1e-300)))
+    saved = nothing - errors(float(best.x))
+    parts = np.array([saved[block].sum() for block in blocks])
+    contradicted = -parts[parts < 0].sum() > _CONTRADICTION * parts[parts > 0].sum()
+    return float(best.x) if gain > _LEAST_GAIN and not contradicted else 0.0
 
 
 def _with_noise_left(frames: Frames, given: Array, now: Calibration, a: IntArray, b: IntArray) -> Calibration:
