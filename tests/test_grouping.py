@@ -177,3 +177,15 @@ def test_flowers_that_are_seen_one_by_one_come_in_no_clusters() -> None:
     seen = csr_matrix((np.ones(N_FRAMES), (order, np.arange(N_FRAMES))), shape=(16, N_FRAMES))
     label = group_flowers(places, seen, None, 0.5, GroupingConfig(), rng=rng)
     np.testing.assert_array_equal(label, np.arange(16))
+
+
+def test_flowers_that_move_as_one_come_in_clusters_however_seldom_they_are_seen_together() -> None:
+    rng = np.random.default_rng(31)
+    places = np.array([[0.0, 0, 1], [0.03, 0, 1], [0.0, 0.04, 1]])
+    seen = rng.random((3, N_FRAMES)) < 0.35
+    motion = motion_of(np.zeros(3, dtype=np.int64), 0.01, rng=rng)
+    hidden = Motion(np.where(seen.T[..., None], motion.u, np.nan), np.where(seen.T, motion.var, np.nan), STAMPS)
+    presence = csr_matrix(1.0 * seen)
+    alone, together = (group_flowers(places, presence, m, 0.5, GroupingConfig(), rng=rng) for m in (None, hidden))
+    np.testing.assert_array_equal(alone, [0, 1, 2])
+    np.testing.assert_array_equal(together, [0, 0, 0])

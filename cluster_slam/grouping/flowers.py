@@ -16,12 +16,15 @@ from cluster_slam.config import GroupingConfig
 from cluster_slam.errors import ConfigError
 from cluster_slam.geometry import Array
 from cluster_slam.grouping.comotion import Motion, motion_evidence
-from cluster_slam.grouping.likelihood import Likelihood
+from cluster_slam.grouping.likelihood import Likelihood, members_by_label
 from cluster_slam.grouping.partition import improve, likeliest_cut
 from cluster_slam.records import IntArray
 
 _FEWEST = 3  # members of what is called a cluster where nothing else says that flowers come in clusters
 _TOGETHER = 0.62  # share of a flower's frames that show its nearest, too: 0.7 to 0.97 of clusters, 0.37 to 0.55 of none
+_MOVE_AS_ONE = (
+    3.0  # evidence of motion, 20 to 1, that there are clusters, however seldom their members are seen together
+)
 _REACH = 7.0  # spacings; flowers that far apart are of two clusters, whatever they do
 
 
@@ -65,7 +68,8 @@ def group_flowers(
     label = likeliest_cut(tree, likelihood)
     if config.method == "spacing":
         label = improve(label, likelihood)
-    return _numbered(label) if _come_in_clusters(places, presence, label) else np.arange(n)
+    move_as_one = likelihood.sums(members_by_label(label).values()).motion > _MOVE_AS_ONE
+    return _numbered(label) if _come_in_clusters(places, presence, label, move_as_one) else np.arange(n)
 
 
 def _numbered(label: NDArray[Any]) -> IntArray:
@@ -91,10 +95,12 @@ def _tree(places: Array, evidence: csr_matrix | None, method: Literal["single", 
     return tree
 
 
-def _come_in_clusters(places: Array, presence: csr_matrix, label: IntArray) -> bool:
-    """Whether this session's flowers come in clusters at all: some have three members, which are seen together."""
+def _come_in_clusters(places: Array, presence: csr_matrix, label: IntArray, move_as_one: bool) -> bool:
+    """Whether this session's flowers come in clusters at all: some have three members that move or are seen as one."""
     if np.unique(label, return_counts=True)[1].max() < _FEWEST:
         return False
+    if move_as_one:
+        return True
     nearest = np.asarray(cKDTree(places).query(places, k=2)[1])[:, 1]
     both = np.asarray(presence.multiply(presence[nearest]).sum(axis=1)).ravel()
     count = np.asarray(presence.sum(axis=1)).ravel()
