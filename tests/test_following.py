@@ -38,10 +38,13 @@ def test_sums_by_group() -> None:
     np.testing.assert_array_equal(sums(values[:0], np.empty(0, dtype=np.int64), 2), np.zeros((2, 2)))
 
 
-def test_lanes_cover_every_frame_once_in_both_directions() -> None:
+@pytest.mark.parametrize("pause", [0.0, 1e5])
+def test_lanes_cover_every_frame_once_in_both_directions(pause: float) -> None:
     stamps = np.sort(np.random.default_rng(1).uniform(0, 60, 700))
+    stamps[300:] += pause
     cut = Lanes.of(stamps, 2.0, both_ways=True)
     assert len(cut.first) > 2
+    assert cut.length.sum() < 2 * 2 * 700  # run-ups are shorter than what they prepare
     for way in (1, -1):
         kept = [
             cut.first[a] + k * way for a in np.flatnonzero(cut.way == way) for k in range(cut.run_up[a], cut.length[a])

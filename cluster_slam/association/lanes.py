@@ -32,8 +32,9 @@ class Lanes:
     def of(cls, stamps: Array, run_up_s: float, *, both_ways: bool) -> Lanes:
         """A session in stretches of about the same number of frames, forwards, or forwards and then backwards."""
         n = len(stamps)
-        duration = float(stamps[-1] - stamps[0]) if n > 1 else 0.0
-        count = int(np.clip(duration / (_STRETCH * run_up_s), 1, max(n, 1)))
+        in_run_up = np.arange(n) - np.searchsorted(stamps, stamps - run_up_s)
+        usual = max(float(np.median(in_run_up)), 1.0)  # frames; a pause of hours is no reason to cut the session finer
+        count = int(np.clip(n / (_STRETCH * usual), 1, n))
         bounds = np.arange(count + 1) * n // count
         begin, end = bounds[:-1], bounds[1:]
         before = np.searchsorted(stamps, stamps[begin] - run_up_s)
