@@ -169,7 +169,7 @@ def _covariance(J: Array, r: Array, weight: Array, seen: StillPoints, prior: Arr
     for n in _N_STRETCHES:
         left_out = _without_each(J, r, weight, seen.label, stretches(seen.stamps, n), prior)
         m, p = left_out.shape
-        few = (m - 1.0) / (m - p) if m > p else 1.0  # m stretches tell a p x p covariance roughly only (Hotelling 1931)
+        few = (m - 1.0) / (m - p - 2.0) if m > p + 2 else 1.0  # so that squares are p on average (Hotelling 1931)
         if m > 1:
             cov = larger(few * (m - 1.0) / m * left_out.T @ left_out + naive @ prior @ naive, cov)
     return no_worse(cov, prior)
