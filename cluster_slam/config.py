@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Literal, TypeVar
@@ -187,6 +188,10 @@ class LocaliseConfig:
     unmapped: float = 0.2  # share of the points that the map does not have: false ones, new flowers
 
 
+_SIGNED = ("_per_day", "evidence", "margin")  # ends of names of options that may be negative ...
+_AT_MOST_ONE = ("probability", "share", "_prior", "detection", "unmapped")  # ... and of those up to one
+_MAY_BE_NONE = ("n_redo", "n_motions")  # counts that may be zero
+
 C = TypeVar("C")
 
 
@@ -213,6 +218,7 @@ def override(config: C, values: Mapping[str, Any], where: str = "") -> C:
             changes[key] = override(current, value, f"{name}.")
         else:
             changes[key] = _checked(name, current, value)
+            _check_range(name, changes[key], is_method=type(config).__module__ == __name__)
     return replace(config, **changes)  # type: ignore[type-var]
 
 
@@ -226,3 +232,18 @@ def _checked(name: str, current: Any, value: Any) -> Any:
     if current is not None and value is not None and not isinstance(value, type(current)):
         raise ConfigError(f"option {name} wants {type(current).__name__}, not {value!r}")
     return value
+
+
+def _check_range(name: str, value: Any, *, is_method: bool) -> None:
+    """Refuse numbers that mean nothing: infinite or negative ones, shares above one, and counts of none in a method."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return
+    key = name.rpartition(".")[2]
+    if not math.isfinite(value):
+        raise ConfigError(f"option {name} wants a finite number, not {value!r}")
+    if value < 0 and not key.endswith(_SIGNED):
+        raise ConfigError(f"option {name} wants a number from 0, not {value!r}")
+    if value > 1 and key.endswith(_AT_MOST_ONE):
+        raise ConfigError(f"option {name} wants a number from 0 to 1, not {value!r}")
+    if value == 0 and is_method and isinstance(value, int) and key not in _MAY_BE_NONE:
+        raise ConfigError(f"option {name} wants a number from 1, not {value!r}")

@@ -24,7 +24,7 @@ from cluster_slam.cli.options import configured
 from cluster_slam.cli.progress import StageProgress
 from cluster_slam.cli.smooth import smooth_config
 from cluster_slam.cli.summary import shown_metric
-from cluster_slam.config import GroupingConfig, SmoothConfig
+from cluster_slam.config import GroupingConfig, MapConfig, SmoothConfig
 from cluster_slam.errors import ConfigError
 from cluster_slam.io.session import open_session
 from cluster_slam.io.session_writer import write_session
@@ -89,6 +89,8 @@ def test_no_arguments_is_help(capsys: pytest.CaptureFixture[str]) -> None:
     bare = capsys.readouterr().out
     assert run(["--help"]) == 0
     assert capsys.readouterr().out == bare
+    assert run(["map"]) == 0
+    assert "  create " in capsys.readouterr().out
     for name in COMMANDS:
         assert re.search(rf"^  {name.split()[0]} +[A-Z].*[^.][.]$", bare, re.MULTILINE)
 
@@ -213,11 +215,22 @@ def test_settings_are_toml_or_words() -> None:
         ("max_rounds", "expected KEY=VALUE"),
         ("=3", "expected KEY=VALUE"),
         ("grouping=3", "option grouping wants a table"),
+        ("outlier_probability=nan", "option outlier_probability wants a finite number, not nan"),
+        ("outlier_probability=2", "option outlier_probability wants a number from 0 to 1, not 2.0"),
+        ("follow.reach_m=-1", "option follow.reach_m wants a number from 0, not -1.0"),
+        ("grouping.linkage_m=-1", "option grouping.linkage_m wants a number from 0, not -1"),
+        ("particles.n_particles=0", "option particles.n_particles wants a number from 1, not 0"),
     ],
 )
 def test_wrong_settings(setting: str, says: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(says)):
         configured(SmoothConfig(), None, [setting])
+
+
+def test_nothing_may_be_wanted_where_that_means_something() -> None:
+    assert configured(SmoothConfig(), None, ["particles.n_redo=0"]).particles.n_redo == 0
+    assert configured(SimulateConfig(), None, ["n_leaves=0"]).n_leaves == 0
+    assert configured(MapConfig(), None, ["growth.size_per_day=-0.01"]).growth.size_per_day == -0.01
 
 
 def test_kmeans_and_the_number_of_clusters_come_together() -> None:

@@ -132,6 +132,9 @@ def _explain(error: Exception) -> int:
     usage = getattr(error, "format_message", None)  # an error of typer's own: unknown option, missing argument
     if isinstance(error, ClusterSlamError):
         _say(str(error))
+    elif callable(usage) and type(error).__name__ == "NoArgsIsHelpError":  # a group without a command, as in "map"
+        typer.echo(usage())
+        return 0
     elif callable(usage):
         context = getattr(error, "ctx", None)
         _say(f"{usage()} (see {context.command_path if context else 'cluster-slam'} --help)")
