@@ -14,7 +14,7 @@ METADATA = {
     "stride": "16",
     "names": "{0: 'flower'}",
     "license": "MIT",
-    "score": "0.54",
+    "score": "0.6",
     "pixel_origin": "centre",
 }
 
