@@ -15,6 +15,7 @@ import pytest
 from cluster_slam.cli.app import run
 from cluster_slam.errors import ConfigError, InputError, OutputError
 from cluster_slam.experiment import read_experiment, run_experiment
+from cluster_slam.experiment.plan import Cell
 from cluster_slam.experiment.run import JOURNAL
 from cluster_slam.experiment.table import mean_interval, summaries, table_csv
 
@@ -90,6 +91,15 @@ def test_intervals_are_students() -> None:
     assert mean == 2.0
     assert high - mean == pytest.approx(4.302653 / np.sqrt(3.0), rel=1e-6)
     assert mean - low == pytest.approx(high - mean)
+
+
+def test_intervals_stay_where_figures_can_be() -> None:
+    cells = [Cell("localise", "moderate", (), (), seed) for seed in (0, 1)]
+    rows = [(cell, {"located": x, "nees_over_6": 3.0 * x}) for cell, x in zip(cells, (0.4, 0.9), strict=True)]
+    shares, nees = summaries(rows)
+    assert (shares.low, shares.high) == (0.0, 1.0)
+    assert nees.low == 0.0
+    assert nees.high > 5.0
 
 
 def test_the_command_writes_tables_and_plots(tmp_path: Path) -> None:

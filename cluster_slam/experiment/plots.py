@@ -32,9 +32,12 @@ def _plot(experiment: Experiment, name: str, found: Sequence[Summary]) -> dict[s
     lines = list(dict.fromkeys(s.point[1:] for s in found))
     numeric = all(isinstance(s.point[0][1], int | float) and not isinstance(s.point[0][1], bool) for s in found)
     ticks = {value: i for i, value in enumerate(experiment.sweep[0][1])}
-    for line in lines:
+    places = [float(v) if numeric else float(ticks[v]) for v in ticks]
+    aside = 0.01 * (max(places) - min(places))  # so that the bars of several lines can be told apart
+    for k, line in enumerate(lines):
         here = [s for s in found if s.point[1:] == line]
         x = [float(s.point[0][1]) if numeric else float(ticks[s.point[0][1]]) for s in here]
+        x = [at + aside * (k - 0.5 * (len(lines) - 1)) for at in x]
         known = [(s.mean - s.low, s.high - s.mean) if math.isfinite(s.low) else (0.0, 0.0) for s in here]
         label = ", ".join(f"{n} = {v}" for n, v in line)
         axes.errorbar(

@@ -12,6 +12,7 @@ from cluster_slam.experiment.plan import Cell, Experiment, Value
 from cluster_slam.experiment.tasks import Figures
 
 CONFIDENCE = 0.95
+_SHARES = ("located", "wrong_located", "within_1cm_1deg", "cluster_f1", "flower_f1", "wrong_share", "failed")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +50,15 @@ def summaries(rows: Sequence[tuple[Cell, Figures]]) -> list[Summary]:
         here = [figures for cell, figures in rows if cell.swept == point]
         for name in figure_names(rows):
             values = np.array([f[name] for f in here if np.isfinite(f.get(name, np.nan))])
-            out.append(Summary(point, name, len(values), *mean_interval(values)))
+            mean, low, high = mean_interval(values)
+            low, high = (float(np.clip(x, 0.0, 1.0 if is_share(name) else np.inf)) for x in (low, high))
+            out.append(Summary(point, name, len(values), mean, low, high))
     return out
+
+
+def is_share(figure: str) -> bool:
+    """Whether a figure is a share, 0 to 1; all others are 0 or more."""
+    return figure in _SHARES or figure.endswith(("idf1", "hota", "_precision", "_recall"))
 
 
 def mean_interval(values: np.ndarray) -> tuple[float, float, float]:
