@@ -245,5 +245,7 @@ def _check_range(name: str, value: Any, *, is_method: bool) -> None:
         raise ConfigError(f"option {name} wants a number from 0, not {value!r}")
     if value > 1 and key.endswith(_AT_MOST_ONE):
         raise ConfigError(f"option {name} wants a number from 0 to 1, not {value!r}")
+    if value in (0, 1) and key.endswith("probability"):
+        raise ConfigError(f"option {name} wants a number between 0 and 1, not {value!r}")
     if value == 0 and is_method and isinstance(value, int) and key not in _MAY_BE_NONE:
         raise ConfigError(f"option {name} wants a number from 1, not {value!r}")

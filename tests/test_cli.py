@@ -217,6 +217,7 @@ def test_settings_are_toml_or_words() -> None:
         ("grouping=3", "option grouping wants a table"),
         ("outlier_probability=nan", "option outlier_probability wants a finite number, not nan"),
         ("outlier_probability=2", "option outlier_probability wants a number from 0 to 1, not 2.0"),
+        ("outlier_probability=1", "option outlier_probability wants a number between 0 and 1, not 1.0"),
         ("follow.reach_m=-1", "option follow.reach_m wants a number from 0, not -1.0"),
         ("grouping.linkage_m=-1", "option grouping.linkage_m wants a number from 0, not -1"),
         ("particles.n_particles=0", "option particles.n_particles wants a number from 1, not 0"),

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cluster_slam.cli.app import run
 from cluster_slam.compare import compare_descriptors
 from cluster_slam.compare.bound import TrueRatio
 from cluster_slam.compare.comparison_page import case_words
@@ -136,3 +137,12 @@ def test_the_folder(tmp_path: Path) -> None:
     (tmp_path / "other" / "notes.txt").write_text("keep me")
     with pytest.raises(OutputError, match=r"notes\.txt"):
         compare_descriptors(tmp_path / "other")
+
+
+def test_recordings_that_are_not_there_are_said_to_be_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before the two minutes that the comparison takes, and not by leaving them out."""
+    assert run(["compare-descriptors", "-o", str(tmp_path / "out"), "--recordings", str(tmp_path / "no")]) == 2
+    assert "no: missing, expected a folder of recordings" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -107,11 +107,22 @@ def _changed(folder: Path, name: str, change: Callable[[list[str]], list[str]]) 
     return {**files, name: ("\n".join([header, *change(rows)]) + "\n").encode()}
 
 
+def _far(row: str) -> str:
+    """A cluster's row with a coordinate that no plant has."""
+    cells = row.split(",")
+    return ",".join([cells[0], "1e300", *cells[2:]])
+
+
 @pytest.mark.parametrize(
     ("name", "change", "says"),
     [
         ("clusters.csv", lambda rows: rows[1:], r"flowers.csv: row \d+: cluster_id is \d+, expected one of those in"),
         ("clusters.csv", lambda rows: [*rows, rows[0]], r"clusters.csv: row \d+: cluster_id \d+ again, expected"),
+        (
+            "clusters.csv",
+            lambda rows: [_far(rows[0]), *rows[1:]],
+            r"clusters.csv: row 2: x is 1e\+300, expected metres",
+        ),
         ("flowers.csv", lambda rows: [rows[0], *rows], r"flowers.csv: row 3: flower_id \d+ again, expected"),
     ],
 )

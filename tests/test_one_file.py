@@ -30,6 +30,12 @@ def test_nothing_else_is_replaced(tmp_path: Path, there: bytes) -> None:
     assert out.read_bytes() == there
 
 
+def test_a_file_is_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_file(tmp_path / "file" / "page.html", PAGE)
+
+
 def test_a_folder_is_no_file(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="is a folder, expected a file"):
         write_file(tmp_path, PAGE)

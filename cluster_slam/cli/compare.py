@@ -10,6 +10,7 @@ import typer
 from cluster_slam.cli.options import JsonOption, QuietOption, SeedOption
 from cluster_slam.cli.progress import StageProgress
 from cluster_slam.cli.summary import print_json, print_table
+from cluster_slam.errors import InputError
 
 
 def command(
@@ -35,6 +36,8 @@ def command(
     from cluster_slam.compare.comparison_page import case_words
     from cluster_slam.compare.contenders import DEFAULT, PAPER
 
+    if recordings is not None and not recordings.is_dir():
+        raise InputError(f"{recordings}: missing, expected a folder of recordings")
     with StageProgress(is_shown=not (quiet or as_json)) as progress:
         done = compare_descriptors(out, seed=seed, recordings=recordings, progress=progress)
     rates = {(o.case, o.name): o.false_match_rate for o in done.outcomes}

@@ -15,7 +15,7 @@ from cluster_slam.io.flowers import POINT_COV, symmetric
 from cluster_slam.io.frames import frames_of
 from cluster_slam.io.result import CLUSTER_COLUMNS, DRIFT_COLUMNS, FLOWER_COLUMNS
 from cluster_slam.io.run_record import RunRecord, read_run
-from cluster_slam.io.tables import NORM_TOLERANCE, TUM_POSE, Table, read_table, read_tum
+from cluster_slam.io.tables import NORM_TOLERANCE, TUM_POSE, Table, check_lengths, read_table, read_tum
 from cluster_slam.io.text import read_text, shown
 from cluster_slam.records import (
     Calibration,
@@ -130,6 +130,7 @@ def _by_id(table: Table, name: str) -> Table:
 
 def _flowers(path: Path, clusters: Clusters) -> Flowers:
     table = _by_id(read_table(path, _columns(FLOWER_COLUMNS)), "flower_id")
+    check_lengths(table, ("x", "y", "z"))
     cluster_ids = _ints(table, "cluster_id")
     strange = np.flatnonzero(~np.isin(cluster_ids, clusters.ids))
     if len(strange):
@@ -148,6 +149,7 @@ def _flowers(path: Path, clusters: Clusters) -> Flowers:
 
 def _clusters(path: Path) -> Clusters:
     table = _by_id(read_table(path, _columns(CLUSTER_COLUMNS), DESCRIPTOR, words=("state",)), "cluster_id")
+    check_lengths(table, ("x", "y", "z"))
     for name in DESCRIPTOR:
         if name not in table.columns:
             raise InputError(f"{path}: row 1: no column '{name}', expected {CLUSTER_COLUMNS}")
