@@ -142,7 +142,7 @@ class MatchConfig:
     wide_share: float = 0.25  # ... for this share of the clusters
     seen_share: float = 0.85  # of the flowers that are there, in a session that looked at them
     ghosts: float = 0.15  # false or new flowers beside each cluster, mean
-    evidence: float = 3.0  # log of the Bayes factor at which a pose is believed: a wrong join costs more than a refusal
+    evidence: float = 1.0  # log of the Bayes factor at which a pose is believed; log of the plants tried on top of it
     margin: float = 6.0  # log of the Bayes factor to the next pose or plant, else it is ambiguous
     scale_min: float = 0.9  # with a similarity: the session's unit of length against the map's
     scale_max: float = 1.1

@@ -132,7 +132,7 @@ def _found(session: Constellation, alive: PlantMap, best: Candidate) -> Found | 
     row, member = np.nonzero(found.partner >= 0)
     a = session.flowers[scene.query.flower[found.query[row], member]]
     pairs, factor = _as_measured(matched_pairs(scene, found), found.pose)
-    pose = fit(pairs, scene.scale_range)
+    pose = found.pose if best.single else fit(pairs, scene.scale_range)  # a field has moved single ones to the session
     scale = float(pose.scale[0])
     T, pairs = best.space.to_map(pose.R[0], pose.t[0], scale), replace(pairs, a=a, b=a)
     return Found(alive, T, scale, pairs, best.space, scene, found, best.single, factor)
