@@ -96,11 +96,11 @@ def _tree(places: Array, evidence: csr_matrix | None, method: Literal["single", 
 
 
 def _come_in_clusters(places: Array, presence: csr_matrix, label: IntArray, move_as_one: bool) -> bool:
-    """Whether this session's flowers come in clusters at all: some have three members that move or are seen as one."""
-    if np.unique(label, return_counts=True)[1].max() < _FEWEST:
-        return False
+    """Whether this session's flowers come in clusters at all: they move as one, or three and more are seen together."""
     if move_as_one:
         return True
+    if np.unique(label, return_counts=True)[1].max() < _FEWEST:
+        return False
     nearest = np.asarray(cKDTree(places).query(places, k=2)[1])[:, 1]
     both = np.asarray(presence.multiply(presence[nearest]).sum(axis=1)).ravel()
     count = np.asarray(presence.sum(axis=1)).ravel()
