@@ -247,6 +247,13 @@ def test_a_configuration_that_is_no_toml(tmp_path: Path) -> None:
         configured(SmoothConfig(), tmp_path / "a.toml", [])
 
 
+@pytest.mark.parametrize("line", ["max_rounds = -1", "max_round = 3", "[grouping]\nmethod = 'magic'"])
+def test_a_wrong_option_of_a_file_names_the_file(tmp_path: Path, line: str) -> None:
+    (tmp_path / "a.toml").write_text(line)
+    with pytest.raises(ConfigError, match=r"a.toml: .*option"):
+        configured(SmoothConfig(), tmp_path / "a.toml", [])
+
+
 # --- simulate, evaluate, check
 
 

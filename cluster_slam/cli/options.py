@@ -37,7 +37,14 @@ def configured(default: C, file: Path | None, settings: Sequence[str]) -> C:
     ConfigError
         An unknown key, a value of the wrong type, or no TOML.
     """
-    config = default if file is None else override(default, _read(file))
+    config = default
+    if file is not None:
+        content = _read(file)
+        try:
+            config = override(config, content)
+            _check_types(config)
+        except ConfigError as error:
+            raise ConfigError(f"{file}: {error}") from None
     for setting in settings:
         config = override(config, _nested(setting))
     _check_types(config)
