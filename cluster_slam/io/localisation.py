@@ -68,6 +68,8 @@ def run_record(found: SessionLocalisation, files: list[str]) -> dict[str, Any]:
 
 
 def _trajectory(stamps: list[str], found: SessionLocalisation) -> str:
+    if not found.is_located.any():
+        return ""  # readers of TUM files stumble over one with comments only
     lines = ["# timestamp tx ty tz qx qy qz qw (T_map_camera, located frames only)"]
     for i in np.flatnonzero(found.is_located).tolist():
         row = tum_from_pose(found.T_map_camera[i])
