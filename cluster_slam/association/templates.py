@@ -77,7 +77,10 @@ class Follower:
         self.world_cov = rotate_cov(R, frames.covs)
         J = point_jacobian(R, frames.points)
         self.cov_of_pose = J @ cov_pose @ np.swapaxes(J, -1, -2)
-        self.lanes = Lanes.of(frames.stamps, _RUN_UP * config.forget_s, both_ways=True)
+        # what stands alone does not swing back to its place: how far off it was seen last is remembered for as long
+        # as it is seen
+        run_up_s = np.inf if self.stand_alone else _RUN_UP * config.forget_s
+        self.lanes = Lanes.of(frames.stamps, run_up_s, both_ways=True)
         self.springs = Springs(len(self.lanes.first), self.n_clusters, config)
 
     def run(self) -> tuple[Followed, Followed]:
