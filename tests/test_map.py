@@ -429,6 +429,38 @@ def test_check_finds_damage(tmp_path: Path) -> None:
             store.connection.execute("RELEASE d")
 
 
+def test_a_map_without_its_end_is_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """SQLite reads what its last page lacks as zeros."""
+    map_of(tmp_path, grown()).close()
+    whole = next(tmp_path.glob("*.map")).read_bytes()
+    cut = tmp_path / "cut" / "m.map"
+    cut.parent.mkdir()
+    for share in (0.5, 0.9, 0.97, 0.999):
+        cut.write_bytes(whole[: int(share * len(whole))])
+        for command in ("check", "list", "undo"):
+            assert run(["map", command, str(cut)]) == 2
+            assert "is damaged" in capsys.readouterr().err
+    cut.write_bytes(whole)
+    assert run(["map", "check", str(cut)]) == 0
+
+
+def test_a_journal_may_hold_what_the_file_lacks(tmp_path: Path) -> None:
+    """As where the program was killed while the journal was brought in."""
+    with map_of(tmp_path, grown()) as store:
+        store.connection.execute("PRAGMA wal_autocheckpoint=0")
+        with store.write() as connection:
+            connection.execute("UPDATE flowers SET presence = 0.5")
+        torn = tmp_path / "torn" / "m.map"
+        torn.parent.mkdir()
+        for end in ("", "-wal"):
+            torn.with_name(torn.name + end).write_bytes(store.path.with_name(store.path.name + end).read_bytes())
+    with torn.open("ab") as file:
+        file.write(bytes(100))
+    with open_map(torn) as store:
+        assert problems(store) == []
+        assert store.read("SELECT min(presence), max(presence) FROM flowers") == [(0.5, 0.5)]
+
+
 def kill_during_add(folder: Path, n: int, seed: int) -> None:
     """Kill ``map add`` at random moments: the map is as before or complete, and adding again finishes the work."""
     rng = np.random.default_rng(seed)

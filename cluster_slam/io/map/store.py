@@ -16,11 +16,11 @@ import numpy as np
 from cluster_slam.errors import InputError, OutputError
 from cluster_slam.geometry import Array, pose_from_tum
 from cluster_slam.io.map import schema
+from cluster_slam.io.map.header import check_file
 from cluster_slam.io.map.rows import Row, plant_from_rows
 from cluster_slam.records import PlantMap
 
 BUSY_S = 5.0  # so long a writer waits for another
-_MAGIC = b"SQLite format 3\0"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,27 +189,13 @@ def open_map(path: str | Path) -> MapStore:
         Missing, no map, damaged, or of a newer schema than this program knows.
     """
     path = Path(path)
-    _check_file(path)
+    check_file(path)
     try:
         connection = sqlite3.connect(path, isolation_level=None, timeout=BUSY_S)
         _prepare(path, connection)
     except sqlite3.Error as error:
         raise refused(path, error) from None
     return MapStore(path, connection)
-
-
-def _check_file(path: Path) -> None:
-    if not path.exists():
-        raise InputError(f"{path}: missing, expected a map (`cluster-slam map create {path}` makes one)")
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, expected a map (one file)")
-    try:
-        with path.open("rb") as file:
-            begin = file.read(100)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}), expected a map") from None
-    if len(begin) < 100 or not begin.startswith(_MAGIC):
-        raise InputError(f"{path}: is no map, expected an SQLite file that `cluster-slam map create` made")
 
 
 def _prepare(path: Path, connection: sqlite3.Connection) -> None:
