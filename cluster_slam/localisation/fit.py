@@ -10,6 +10,7 @@ from cluster_slam.geometry import Array, inverse, se3_exp, skew, transform
 from cluster_slam.localisation import sway
 from cluster_slam.localisation.landmarks import Landmarks
 from cluster_slam.localisation.scene import ErrorScale, Look, covs_at
+from cluster_slam.localisation.shifts import settled
 from cluster_slam.records import IntArray
 from tracking.assignment import assign
 from tracking.gating import mahalanobis_sq, matching_log_likelihood
@@ -66,12 +67,17 @@ def associate(
     point_cov = R @ look.covs @ R.T + pose
     shared = marks.shared_covs + scale.sway_m**2 * np.eye(3)
     largest = np.sqrt(GATE_CHI2 * (np.trace(point_cov, axis1=1, axis2=2).max() + 3.0 * _largest(marks, shared)))
-    off = seen[:, None] - marks.positions
-    i, j = np.nonzero((off**2).sum(-1) < largest**2)
+    own = R @ look.covs @ R.T
+    drifted = marks.drifted(scale.sway_m)
+    places, covs, free = settled(
+        seen, own, pose, marks.positions, marks.covs, marks.cluster, shared, drifted, null_density
+    )
+    off = seen[:, None] - places
+    i, j = np.nonzero(((off**2).sum(-1) < largest**2) & free)
     if len(i) == 0:
         return i, j
     innovation = off[i, j]
-    S = point_cov[i] + marks.covs[j] + shared[marks.cluster[j]]
+    S = np.where(drifted[marks.cluster[j], None, None], own[i], point_cov[i]) + covs[j]
     d2 = mahalanobis_sq(innovation, S)
     likelihood = matching_log_likelihood(innovation, S)
     near, column = np.unique(j, return_inverse=True)

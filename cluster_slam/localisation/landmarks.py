@@ -10,10 +10,10 @@ import numpy as np
 from cluster_slam.constellation import growth
 from cluster_slam.errors import InputError
 from cluster_slam.geometry import Array
-from cluster_slam.records import IntArray, PlantMap
+from cluster_slam.records import BoolArray, IntArray, PlantMap
 
 _GONE_BELOW = 0.1  # presence
-_LEAST_SIGMA_M = 1e-5  # a place that is stated exact still has an invertible covariance
+LEAST_SIGMA_M = 1e-5  # a place that is stated exact still has an invertible covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +42,10 @@ class Landmarks:
     @property
     def n_clusters(self) -> int:
         return len(self.shared_covs)
+
+    def drifted(self, sway_m: float) -> BoolArray:
+        """Which clusters (c,) may stand off their places by more than they sway."""
+        return np.asarray(np.trace(self.shared_covs, axis1=1, axis2=2) > 3.0 * sway_m**2)
 
     @cached_property
     def spread(self) -> float:
@@ -80,7 +84,7 @@ def landmarks(
         raise InputError(f"the map of plant {plant!r} holds a position that is not finite")
     if len(np.unique(ids)) != n:
         raise InputError(f"the map of plant {plant!r} holds a flower id twice")
-    floor = _LEAST_SIGMA_M**2 * np.eye(3)
+    floor = LEAST_SIGMA_M**2 * np.eye(3)
     own = np.zeros((n, 3, 3)) if covs is None else np.asarray(covs, dtype=np.float64)
     shared = np.zeros((n_clusters, 3, 3)) if shared_covs is None else np.asarray(shared_covs, dtype=np.float64)
     return Landmarks(plant, ids, cluster_ids, positions, own + floor, shared + floor)

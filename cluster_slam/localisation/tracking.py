@@ -1,9 +1,10 @@
 """The camera followed through a frozen map: a Kalman filter over pose, mounting and the clusters' displacements.
 
 The state holds tangents of the camera pose (z), of ``T_map_world`` (w, where the given poses are absolute) and of the
-hand-eye transform (x, where the poses are the flange's), and of each cluster met so far two displacements: one that
-stays (b: how wrong the map has it) and one that comes and goes (s: sway, an Ornstein-Uhlenbeck process). So errors that
-the flowers of a cluster share, in a frame and over frames, are counted once.
+hand-eye transform (x, where the poses are the flange's), of each cluster met so far two displacements: one that stays
+(b: how wrong the map has it) and one that comes and goes (s: sway, an Ornstein-Uhlenbeck process), and of each flower
+met so far how wrong the map has its place in the cluster (f). So what the map is wrong by is counted once, however many
+frames see it.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ import numpy as np
 from cluster_slam.geometry import Array, adjoint, inverse, se3_exp, se3_log, skew, transform
 from cluster_slam.localisation import sway
 from cluster_slam.localisation.fit import GATE_CHI2, LOG_2PI
-from cluster_slam.localisation.landmarks import Landmarks
+from cluster_slam.localisation.landmarks import LEAST_SIGMA_M, Landmarks
 from cluster_slam.localisation.motion import Motion
 from cluster_slam.localisation.scene import ErrorScale, Look, covs_at
+from cluster_slam.localisation.shifts import settled
 from cluster_slam.records import IntArray
 from tracking.assignment import assign
 from tracking.gating import mahalanobis_sq
@@ -65,6 +67,7 @@ class Track:
     P: Array  # (d, d)
     frame: int
     clusters: dict[int, _Cluster] = field(default_factory=dict)
+    flowers: dict[int, int] = field(default_factory=dict)  # column of each flower's f in the state
     d: Array = field(default_factory=lambda: np.zeros(0))  # displacements, in the order of the state after the poses
 
     @property
@@ -133,15 +136,27 @@ class Track:
     def _meet(self, cluster: int) -> _Cluster:
         """The cluster's place in the state, made where it is new."""
         if cluster not in self.clusters:
-            at = len(self.P)
-            grown = np.zeros((at + 6, at + 6))
-            grown[:at, :at] = self.P
-            grown[at : at + 3, at : at + 3] = self.marks.shared_covs[cluster]
-            grown[at + 3 :, at + 3 :] = self.scale.sway_m**2 * np.eye(3)
-            self.P = grown
-            self.d = np.concatenate([self.d, np.zeros(6)])
-            self.clusters[cluster] = _Cluster(at)
+            sway_cov = self.scale.sway_m**2 * np.eye(3)
+            self.clusters[cluster] = _Cluster(self._grow(np.stack([self.marks.shared_covs[cluster], sway_cov])))
         return self.clusters[cluster]
+
+    def _meet_flowers(self, flowers: IntArray) -> None:
+        """Places in the state for the flowers that are new; those that the map states exact need none."""
+        wrong = np.trace(self.marks.covs[flowers], axis1=1, axis2=2) > 3.0 * (2.0 * LEAST_SIGMA_M) ** 2
+        new = [f for f in flowers[wrong].tolist() if f not in self.flowers]
+        if new:
+            at = self._grow(self.marks.covs[new])
+            self.flowers |= {f: at + 3 * k for k, f in enumerate(new)}
+
+    def _grow(self, covs: Array) -> int:
+        """Displacements (k, 3) about zero with covariances (k, 3, 3), put behind the state; the column of the first."""
+        at, k = len(self.P), len(covs)
+        grown = np.zeros((at + 3 * k, at + 3 * k))
+        grown[:at, :at] = self.P
+        columns = at + np.arange(3 * k).reshape(k, 3)
+        grown[columns[:, :, None], columns[:, None, :]] = covs
+        self.P, self.d = grown, np.concatenate([self.d, np.zeros(3 * k)])
+        return at
 
     def displacement(self, cluster: int) -> Array:
         """Where the cluster stands from its place in the map (3,), m, as far as is known."""
@@ -159,14 +174,26 @@ class Track:
         seen = transform(self.T, look.points[points])
         R = self.T[:3, :3]
         J = np.concatenate([-R @ skew(look.points[points]), np.broadcast_to(R, (len(points), 3, 3))], axis=-1)
-        point_cov = R @ look.covs[points] @ R.T + J @ self.pose_cov @ np.swapaxes(J, 1, 2)
-        places, covs = (x[flowers] for x in self._places())
+        own_cov = R @ look.covs[points] @ R.T
+        pose_covs = J @ self.pose_cov @ np.swapaxes(J, 1, 2)
+        point_cov = own_cov + pose_covs
+        places, covs, shared = self._places()
+        places, covs = places[flowers], covs[flowers]
+        of, drifted = self.marks.cluster[flowers], self.marks.drifted(self.scale.sway_m)
+        free = np.ones(len(flowers), bool)
+        if drifted.any():
+            own = self._own_covs(flowers)
+            settled_places, settled_covs, free = settled(
+                seen, own_cov, pose_covs, places, own, of, shared, drifted, null_density
+            )
+            places = settled_places
+            covs = np.where(drifted[of, None, None], settled_covs, covs)
         largest = np.trace(point_cov, axis1=1, axis2=2).max() + np.trace(covs, axis1=1, axis2=2)
         off = seen[:, None] - places
-        i, j = np.nonzero((off**2).sum(-1) < GATE_CHI2 * largest)
+        i, j = np.nonzero(((off**2).sum(-1) < GATE_CHI2 * largest) & free)
         if len(i) == 0:
             return i, j
-        S = point_cov[i] + covs[j]
+        S = np.where(drifted[of[j], None, None], own_cov[i], point_cov[i]) + covs[j]
         d2 = mahalanobis_sq(off[i, j], S)
         cost = np.full((len(points), len(places)), np.inf)
         log_det = np.linalg.slogdet(S)[1]
@@ -190,20 +217,43 @@ class Track:
         self.update(look, more, which)
         return np.concatenate([rows, more]), np.concatenate([flowers, which])
 
-    def _places(self) -> tuple[Array, Array]:
-        """Predicted places (f, 3) of all flowers, and their covariances (f, 3, 3)."""
+    def _own_covs(self, flowers: IntArray) -> Array:
+        """Covariances (m, 3, 3) of flowers about their clusters, as known by now."""
+        covs = self.marks.covs[flowers]
+        for k, f in enumerate(flowers.tolist()):
+            if f in self.flowers:
+                at = slice(self.flowers[f], self.flowers[f] + 3)
+                covs[k] = self.P[at, at]
+        return covs
+
+    def _places(self) -> tuple[Array, Array, Array]:
+        """Predicted places (f, 3) of all flowers, their covariances (f, 3, 3), and what clusters share (c, 3, 3)."""
         shift = np.zeros((self.marks.n_clusters, 3))
         shared = self.marks.shared_covs + self.scale.sway_m**2 * np.eye(3)
         for cluster, c in self.clusters.items():
             b, s = slice(c.at, c.at + 3), slice(c.at + 3, c.at + 6)
             shift[cluster] = self.displacement(cluster)
             shared[cluster] = self.P[b, b] + self.P[s, s] + self.P[b, s] + self.P[s, b]
-        return self.marks.positions + shift[self.marks.cluster], self.marks.covs + shared[self.marks.cluster]
+        places = self.marks.positions + shift[self.marks.cluster]
+        covs = self.marks.covs + shared[self.marks.cluster]
+        if self.flowers:
+            met = np.array(list(self.flowers))
+            columns = self._columns(met)
+            places[met] += self.d[columns[:, 2] - self.n_poses]
+            covs[met] = self.P[columns[:, :, None, :, None], columns[:, None, :, None, :]].sum(axis=(1, 2))
+        return places, covs, shared
+
+    def _columns(self, flowers: IntArray) -> IntArray:
+        """Columns (m, 3, 3) of the state in which b, s and f of flowers with an f stand."""
+        of = [self.clusters[c].at for c in self.marks.cluster[flowers].tolist()]
+        at = np.array([[b, b + 3, self.flowers[f]] for b, f in zip(of, flowers.tolist(), strict=True)])
+        return np.asarray(at[:, :, None] + np.arange(3), dtype=np.int64)
 
     def update(self, look: Look, rows: IntArray, flowers: IntArray, n_iterations: int = 1) -> tuple[float, float]:
         """Take the matched points in; log likelihood and chi-square of their innovations."""
         for cluster in np.unique(self.marks.cluster[flowers]).tolist():
             self._meet(cluster).seen_s = float(self.motion.stamps[self.frame])
+        self._meet_flowers(flowers)
         T0, W0, X0, d0, P0 = self.T, self.W, self.X, self.d, self.P
         moved = np.zeros(len(self.P))
         log_likelihood = nis = 0.0
@@ -258,15 +308,20 @@ class Track:
         of = self.marks.cluster[flowers]
         at = np.array([self.clusters[c].at for c in of.tolist()])
         places = self.marks.positions[flowers] + np.array([self.displacement(c) for c in of.tolist()])
+        own = np.array([self.flowers.get(f, -1) for f in flowers.tolist()])
+        met = own >= 0
+        places[met] += self.d[own[met, None] + np.arange(3) - self.n_poses]
         h = transform(inverse(self.T), places)
         H = np.zeros((m, 3, len(self.P)))
         H[:, :, :6] = np.concatenate([skew(h), np.broadcast_to(-np.eye(3), (m, 3, 3))], axis=-1)
         k, axis = np.arange(m)[:, None, None], np.arange(3)[:, None]
         H[k, axis, at[:, None, None] + np.arange(3)] = Rt
         H[k, axis, at[:, None, None] + 3 + np.arange(3)] = Rt
+        H[k[met], axis, own[met, None, None] + np.arange(3)] = Rt
         V = np.zeros((m, 3, m, 3))
-        covs = covs_at(look, rows, h[:, 2], self.scale)
-        V[np.arange(m), :, np.arange(m)] = covs + Rt @ self.marks.covs[flowers] @ Rt.T
+        covs = covs_at(look, rows, h[:, 2], self.scale).copy()
+        covs[~met] += Rt @ self.marks.covs[flowers[~met]] @ Rt.T
+        V[np.arange(m), :, np.arange(m)] = covs
         return H.reshape(3 * m, -1), (look.points[rows] - h).ravel(), V.reshape(3 * m, 3 * m)
 
     def _move(self, T: Array, W: Array | None, X: Array | None, d: Array, moved: Array) -> None:
