@@ -189,3 +189,17 @@ def test_flowers_that_move_as_one_come_in_clusters_however_seldom_they_are_seen_
     alone, together = (group_flowers(places, presence, m, 0.5, GroupingConfig(), rng=rng) for m in (None, hidden))
     np.testing.assert_array_equal(alone, [0, 1, 2])
     np.testing.assert_array_equal(together, [0, 0, 0])
+
+
+def test_clusters_of_two_are_clusters() -> None:
+    rng = np.random.default_rng(5)
+    middles = np.array([[0.0, 0, 1], [0.5, 0, 1], [0.0, 0.5, 1], [0.5, 0.5, 1], [1.0, 0.2, 1], [1.1, 0.7, 1]])
+    places = np.repeat(middles, 2, axis=0) + 0.02 * rng.standard_normal((12, 3))
+    np.testing.assert_array_equal(grouped(places, None), np.repeat(np.arange(6), 2))
+
+
+def test_flowers_that_stand_anywhere_are_seldom_called_clusters() -> None:
+    """The likeliest of many partitions has clusters by chance: three of a few loose flowers are often neighbours."""
+    rng = np.random.default_rng(0)
+    clustered = [grouped(rng.uniform(0, 1, (6, 3)) * np.array([2.0, 0.3, 0.6]), None).max() < 5 for _ in range(60)]
+    assert np.mean(clustered) < 0.1

@@ -20,11 +20,8 @@ from cluster_slam.grouping.likelihood import Likelihood, members_by_label
 from cluster_slam.grouping.partition import improve, likeliest_cut
 from cluster_slam.records import IntArray
 
-_FEWEST = 3  # members of what is called a cluster where nothing else says that flowers come in clusters
 _TOGETHER = 0.62  # share of a flower's frames that show its nearest, too: 0.7 to 0.97 of clusters, 0.37 to 0.55 of none
-_MOVE_AS_ONE = (
-    3.0  # evidence of motion, 20 to 1, that there are clusters, however seldom their members are seen together
-)
+_SURE = 3.0  # log-likelihood, 20 to 1, that there are clusters
 _REACH = 7.0  # spacings; flowers that far apart are of two clusters, whatever they do
 
 
@@ -68,8 +65,7 @@ def group_flowers(
     label = likeliest_cut(tree, likelihood)
     if config.method == "spacing":
         label = improve(label, likelihood)
-    move_as_one = likelihood.sums(members_by_label(label).values()).motion > _MOVE_AS_ONE
-    return _numbered(label) if _come_in_clusters(places, presence, label, move_as_one) else np.arange(n)
+    return _numbered(label) if _come_in_clusters(places, presence, label, likelihood) else np.arange(n)
 
 
 def _numbered(label: NDArray[Any]) -> IntArray:
@@ -95,11 +91,17 @@ def _tree(places: Array, evidence: csr_matrix | None, method: Literal["single", 
     return tree
 
 
-def _come_in_clusters(places: Array, presence: csr_matrix, label: IntArray, move_as_one: bool) -> bool:
-    """Whether this session's flowers come in clusters at all: they move as one, or three and more are seen together."""
-    if move_as_one:
+def _come_in_clusters(places: Array, presence: csr_matrix, label: IntArray, likelihood: Likelihood) -> bool:
+    """Whether this session's flowers come in clusters at all.
+
+    They do where they move as one, however seldom they are seen together; and where they are seen together and stand
+    nearer than flowers that are all loose would. The likeliest of all partitions is no worse than all loose by the way
+    it was found: it must be likelier for sure.
+    """
+    clustered = likelihood.sums(members_by_label(label).values())
+    if clustered.motion > _SURE:
         return True
-    if np.unique(label, return_counts=True)[1].max() < _FEWEST:
+    if likelihood.of(clustered) - likelihood(np.arange(len(places))) < _SURE:
         return False
     nearest = np.asarray(cKDTree(places).query(places, k=2)[1])[:, 1]
     both = np.asarray(presence.multiply(presence[nearest]).sum(axis=1)).ravel()
