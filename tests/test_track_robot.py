@@ -82,7 +82,7 @@ def flower_idf1(out: Path, recorded: Path, session: Session, truth: Truth) -> tu
 
 def test_a_robot_is_followed_through_a_loss(tmp_path: Path) -> None:
     """The same flowers are the same before and after the arm was gone, and all of it is on disk as a session."""
-    folder, session, truth = recording(tmp_path, 9.0)
+    folder, session, truth = recording(tmp_path, 14.0)
     with EmulatedRobot(folder / "poses.txt", "--fault", "drop:0.5@5") as robot:
         process = start(robot, tmp_path, "--record", str(tmp_path / "kept"))
         begin = clock_of(robot)
@@ -102,7 +102,7 @@ def test_a_robot_is_followed_through_a_loss(tmp_path: Path) -> None:
 
 
 def test_sigterm_ends_a_live_run_in_order_and_a_kill_can_be_resumed(tmp_path: Path) -> None:
-    folder, session, truth = recording(tmp_path, 9.0)
+    folder, session, truth = recording(tmp_path, 14.0)
     with EmulatedRobot(folder / "poses.txt") as robot:
         first = start(robot, tmp_path)
         begin = clock_of(robot)
@@ -115,8 +115,12 @@ def test_sigterm_ends_a_live_run_in_order_and_a_kill_can_be_resumed(tmp_path: Pa
             time.sleep(0.05)
         first.kill()
         first.communicate(timeout=10)
+        before = (journal / "frames.bin").stat().st_size
         second = start(robot, tmp_path, "--resume", "--record", str(tmp_path / "kept"))
         player.join()
+        while (journal / "frames.bin").stat().st_size <= before:  # it goes on
+            assert time.monotonic() < end
+            time.sleep(0.05)
         time.sleep(0.5)
         second.send_signal(signal.SIGTERM)
         text, errors = second.communicate(timeout=180)
