@@ -67,25 +67,25 @@ def test_odometry_is_the_least_squares_of_its_steps(flange: bool) -> None:
         H[6 * i : 6 * i + 6, 6 * i + 6 : 6 * i + 12] = C
         H[6 * i + 6 : 6 * i + 12, 6 * i : 6 * i + 6] = C.T
     H[6 * N :, 6 * N :] = prior.x_information
+    less_x = np.eye(6 * N + k)  # y = z - x
+    less_x[: 6 * N, 6 * N :] = -np.tile(np.eye(6), (N, 1))[:, :k]
+    H = less_x.T @ H @ less_x
     scale = np.sqrt(np.diag(H))
     np.testing.assert_allclose(H / scale / scale[:, None], J.T @ J / scale / scale[:, None], atol=1e-4)
-    vector = np.concatenate([prior.z_vector.ravel(), prior.x_vector])
+    vector = less_x.T @ np.concatenate([prior.z_vector.ravel(), prior.x_vector])
     np.testing.assert_allclose(vector / scale, -J.T @ at(0 * eye[0]) / scale, atol=1e-3 * np.abs(at(0 * eye[0])).max())
 
 
-def test_an_unknown_hand_eye_transform_moves_all_places() -> None:
-    """The flange's first pose is exact, the camera's is as uncertain as its mounting, and so is what it sees."""
-    n, n_places = 2, 6
-    model, T, X = _model(flange=True, size=0.0, n=n)
-    assert model.cov_step is not None
+def _seen_from(model: PoseModel, T: Array, X: Array, n_places: int = 6) -> tuple[BatchSmoother, Estimate]:
+    """All places seen from all poses without error."""
+    n = len(T)
     places = transform(T[0], np.random.default_rng(5).uniform(-0.2, 0.2, (n_places, 3)) + np.array([0, 0, 0.6]))
     frame, label = np.repeat(np.arange(n), n_places), np.tile(np.arange(n_places), n)
-    points = transform(inverse(T)[frame], places[label])
     frames = Frames(
         np.arange(len(frame)),
         np.arange(n + 1) * n_places,
         frame,
-        points,
+        transform(inverse(T)[frame], places[label]),
         np.tile(1e-8 * np.eye(3), (len(frame), 1, 1)),
         np.arange(n) / 30,
     )
@@ -98,14 +98,42 @@ def test_an_unknown_hand_eye_transform_moves_all_places() -> None:
         stretch_sigma=np.empty(0),
     )
     smoother = BatchSmoother(frames, model, label, pairs)
-    e = Estimate(T, X, places, np.zeros((n, 3)), np.ones(len(frame)), np.zeros(len(frame)))
+    return smoother, Estimate(T, X, places, np.zeros((n, 3)), np.ones(len(frame)), np.zeros(len(frame)))
+
+
+def test_an_unknown_hand_eye_transform_moves_all_places() -> None:
+    """The flange's first pose is exact, the camera's is as uncertain as its mounting, and so is what it sees."""
+    model, T, X = _model(flange=True, size=0.0, n=2)
+    smoother, e = _seen_from(model, T, X)
     told = smoother.marginals(e)
     assert told.hand_eye is not None
-    R, c = T[0, :3, :3], points[:n_places]
-    for j in range(n_places):
-        x, y, z = c[j]
+    R, points = T[0, :3, :3], smoother.c[:6]
+    for j, (x, y, z) in enumerate(points):
         across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         J = R @ np.concatenate([-across, np.eye(3)], axis=1)
         block = told.places[3 * j : 3 * j + 3, 3 * j : 3 * j + 3]
         np.testing.assert_allclose(block, J @ told.hand_eye @ J.T, rtol=0.01, atol=1e-7)
     assert told.hand_eye[0, 0] > 0.2 * _HAND_EYE[0, 0]  # one step tells little
+
+
+def test_a_vehicle_that_stays_in_a_plane_is_solved() -> None:
+    """Its steps are known next to exactly out of the plane, whatever the mounting of the camera."""
+    n = 300
+    _, _, X = _model(flange=True, size=0.0)
+    steps = np.zeros((n - 1, 6))
+    steps[:, [2, 3, 4]] = np.random.default_rng(7).normal(0, 0.02, (n - 1, 3))
+    given = [np.eye(4)]
+    for D in se3_exp(steps):
+        given.append(given[-1] @ D)
+    cov = np.tile(np.diag([1e-14, 1e-14, 1e-6, 1e-6, 1e-6, 1e-14]), (n - 1, 1, 1))
+    model = PoseModel(np.array(given), np.eye(6), cov, X, _HAND_EYE)
+    smoother, e = _seen_from(model, np.array(given) @ X, X)
+    moved, change = smoother.step(e)
+    assert change < 1e-8
+    assert moved.X is not None
+    np.testing.assert_allclose(moved.X, X, atol=1e-8)
+    told = smoother.marginals(moved)
+    assert told.hand_eye is not None
+    size = np.linalg.eigvalsh(told.hand_eye / np.sqrt(np.outer(np.diag(_HAND_EYE), np.diag(_HAND_EYE))))
+    assert 0.0 < size[0] < 0.1  # learned ...
+    assert size[-1] == pytest.approx(1.0, abs=0.01)  # ... but for the height over the plane

@@ -35,7 +35,7 @@ class Linearised:
     b_information: Array  # (s,) ... known so well
     z_information: Array  # (n, 6, 6)
     z_vector: Array  # (n, 6)
-    chain: Array | None  # (n - 1, 6, 6) information of each pose with the next; None where each is known for itself
+    chain: Array | None  # (n - 1, 6, 6) information of each pose with the next; None: each for itself. With it z less x
     zx_information: Array  # (n, 6, k) of poses with the hand-eye tangent; k is 6, or 0 where there is none
     x_information: Array  # (k, k)
     x_vector: Array  # (k,)

@@ -28,7 +28,11 @@ class PoseModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosePrior:
-    """Information and its vector of the tangents z of n poses and x of the hand-eye transform, k = 6, or 0 without."""
+    """Information and its vector of the tangents z of n poses and x of the hand-eye transform, k = 6, or 0 without.
+
+    With a ``chain`` that of y = z - x: x moves all poses of the camera, and steps of the flange do not see it. In z
+    and x the same would be differences of large numbers, where a vehicle's steps are known next to exactly.
+    """
 
     z_information: Array  # (n, 6, 6)
     z_vector: Array  # (n, 6)
@@ -49,7 +53,7 @@ def pose_prior(model: PoseModel, lever: Array, T: Array, X: Array | None) -> Pos
         x_vector = -x_information @ se3_log(inverse(model.X0) @ X)
     if model.cov_step is not None:
         tied = _odometry(predicted, lever @ model.cov_step @ lever.T, T, k)
-        return replace(tied, x_information=tied.x_information + x_information, x_vector=tied.x_vector + x_vector)
+        return replace(tied, x_information=x_information, x_vector=x_vector)
     W = np.linalg.inv(lever @ model.cov @ lever.T)
     error = se3_log(inverse(predicted) @ T)
     by_x = np.zeros((len(T), 6, 0)) if X is None else -adjoint(inverse(T) @ predicted)
@@ -67,30 +71,19 @@ def pose_prior(model: PoseModel, lever: Array, T: Array, X: Array | None) -> Pos
 def _odometry(predicted: Array, cov_step: Array, T: Array, k: int) -> PosePrior:
     """The first pose defines the world, each step (n - 1, 6, 6) of the camera ties two poses.
 
-    Of the flange's poses both depend on the hand-eye transform, k = 6: T_0 = F_0 X, and a step is X^-1 D X. Were only
-    the camera's poses tied, the world would be the first camera's, and an error of X would be missing from all places.
+    Of the flange's poses both depend on the hand-eye transform, k = 6: T_0 = F_0 X, and a step is X^-1 D X. The
+    camera's tangents are z = y + x with y the flange's, brought to the camera; of x by itself odometry says nothing.
     """
     step = np.linalg.inv(cov_step)
     now = inverse(T[:-1]) @ T[1:]
     error = se3_log(inverse(inverse(predicted[:-1]) @ predicted[1:]) @ now)
     by_first = -adjoint(inverse(now))
-    by_x = (-by_first - np.eye(6))[..., :k]
     chain = np.swapaxes(by_first, 1, 2) @ step
-    z_information, z_vector = np.zeros((len(T), 6, 6)), np.zeros((len(T), 6))
-    z_information[1:] += step
-    z_information[:-1] += chain @ by_first
-    z_vector[1:] -= (step @ error[..., None])[..., 0]
-    z_vector[:-1] -= (chain @ error[..., None])[..., 0]
-    zx_information = np.zeros((len(T), 6, k))
-    zx_information[1:] += step @ by_x
-    zx_information[:-1] += chain @ by_x
-    x_information = np.einsum("nai,nab,nbj->ij", by_x, step, by_x, optimize=True)
-    x_vector = -np.einsum("nai,nab,nb->i", by_x, step, error, optimize=True)
-    first_error = se3_log(inverse(predicted[0]) @ T[0])
-    first_by_x = -adjoint(inverse(T[0]) @ predicted[0])[:, :k]
-    z_information[0] += _TIGHT * np.eye(6)
-    z_vector[0] -= _TIGHT * first_error
-    zx_information[0] += _TIGHT * first_by_x
-    x_information += _TIGHT * first_by_x.T @ first_by_x
-    x_vector -= _TIGHT * first_by_x.T @ first_error
-    return PosePrior(z_information, z_vector, chain, zx_information, x_information, x_vector)
+    information, vector = np.zeros((len(T), 6, 6)), np.zeros((len(T), 6))
+    information[0] = _TIGHT * np.eye(6)
+    vector[0] = -_TIGHT * se3_log(inverse(predicted[0]) @ T[0])
+    information[1:] += step
+    information[:-1] += chain @ by_first
+    vector[1:] -= (step @ error[..., None])[..., 0]
+    vector[:-1] -= (chain @ error[..., None])[..., 0]
+    return PosePrior(information, vector, chain, np.zeros((len(T), 6, k)), np.zeros((k, k)), np.zeros(k))

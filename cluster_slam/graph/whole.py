@@ -34,12 +34,13 @@ def solve_step(links: Links, at: Linearised) -> Increments:
     def rows(first: int, last: int, width: int) -> Array:
         return np.array([delta.at(key) for key in range(first, last)]).reshape(last - first, width)
 
+    x = rows(keys.x, keys.end, 6).ravel()
     return Increments(
-        z=rows(keys.z, keys.b, 6),
+        z=rows(keys.z, keys.b, 6) + (x if _from_x(at) else 0.0),
         d=rows(keys.d, keys.z, 3),
         b=rows(keys.b, keys.l, 3),
         places=rows(keys.l, keys.x, 3),
-        x=rows(keys.x, keys.end, 6).ravel(),
+        x=x,
     )
 
 
@@ -59,10 +60,17 @@ def whole_graph(links: Links, at: Linearised) -> gtsam.GaussianFactorGraph:
     z, j, d = ((keys.z + links.frame).tolist(), (keys.l + links.landmark).tolist(), (keys.d + links.pair).tolist())
     for k in np.flatnonzero(at.A_l.any(axis=(1, 2))).tolist():  # those that have any weight
         graph.add(gtsam.JacobianFactor(z[k], at.A_z[k], j[k], at.A_l[k], d[k], at.A_l[k], at.r[k], _UNIT))
+    if _from_x(at):
+        _add_seen_from_x(graph, keys, links, at)
     weak = np.asfortranarray(np.sqrt(at.place_information) * np.eye(3))
     for key in range(keys.l, keys.x):
         graph.add(gtsam.JacobianFactor(key, weak, np.zeros(3), _UNIT))
     return graph
+
+
+def _from_x(at: Linearised) -> bool:
+    """Whether the tangents of poses are counted from where the hand-eye transform takes them: flanges in a chain."""
+    return at.chain is not None and len(at.x_vector) > 0
 
 
 def _add_poses(graph: gtsam.GaussianFactorGraph, keys: _Keys, at: Linearised) -> None:
@@ -75,6 +83,23 @@ def _add_poses(graph: gtsam.GaussianFactorGraph, keys: _Keys, at: Linearised) ->
         for i, H in enumerate(at.zx_information):
             graph.add(gtsam.HessianFactor(keys.z + i, keys.x, nothing, H, none, nothing, none, 0.0))
         graph.add(gtsam.HessianFactor(keys.x, at.x_information, at.x_vector, 0.0))
+
+
+def _add_seen_from_x(graph: gtsam.GaussianFactorGraph, keys: _Keys, links: Links, at: Linearised) -> None:
+    """What x, which moves all poses, adds to the information of the observations; factors hold three unknowns only."""
+    by_x, none, nothing = np.swapaxes(at.A_z, 1, 2), np.zeros(6), np.zeros((6, 6))
+    graph.add(gtsam.HessianFactor(keys.x, (by_x @ at.A_z).sum(0), (by_x @ at.r[..., None]).sum(0).ravel(), 0.0))
+    for first, of, A, n in (
+        (keys.z, links.frame, at.A_z, links.n_frames),
+        (keys.l, links.landmark, at.A_l, links.n_places),
+        (keys.d, links.pair, at.A_l, len(links.pair_frame)),
+    ):
+        width = A.shape[2]
+        H = np.zeros((n, width, 6))
+        np.add.at(H, of, np.swapaxes(A, 1, 2) @ at.A_z)
+        empty, zero = np.zeros((width, width)), np.zeros(width)
+        for i, block in enumerate(H):
+            graph.add(gtsam.HessianFactor(first + i, keys.x, empty, block, zero, nothing, none, 0.0))
 
 
 def _add_displacements(graph: gtsam.GaussianFactorGraph, keys: _Keys, links: Links, at: Linearised) -> None:
