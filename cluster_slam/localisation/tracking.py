@@ -183,10 +183,9 @@ class Track:
         free = np.ones(len(flowers), bool)
         if drifted.any():
             own = self._own_covs(flowers)
-            settled_places, settled_covs, free = settled(
+            places, settled_covs, free = settled(
                 seen, own_cov, pose_covs, places, own, of, shared, drifted, null_density
             )
-            places = settled_places
             covs = np.where(drifted[of, None, None], settled_covs, covs)
         largest = np.trace(point_cov, axis1=1, axis2=2).max() + np.trace(covs, axis1=1, axis2=2)
         off = seen[:, None] - places
@@ -260,13 +259,15 @@ class Track:
         for iteration in range(n_iterations):
             H, r, V = self._linearised(look, rows, flowers)
             innovation = r + H @ moved
-            PH = P0 @ H.T
-            S = H @ PH + V
+            seen = np.flatnonzero(H.any(axis=0))  # most of what was met so far is not in this frame
+            H = H[:, seen]
+            PH = P0[:, seen] @ H.T
+            S = H @ PH[seen] + V
             if iteration == 0:
                 V_points = np.stack([V[k : k + 3, k : k + 3] for k in range(0, len(V), 3)])
                 self._shake(S, V_points, innovation, flowers, P0)
-                PH = P0 @ H.T
-                S = H @ PH + V
+                PH = P0[:, seen] @ H.T
+                S = H @ PH[seen] + V
             L = np.linalg.cholesky(S)
             white = np.linalg.solve(L, np.column_stack([innovation, PH.T]))
             moved = white[:, 1:].T @ white[:, 0]
