@@ -21,6 +21,7 @@ from cluster_slam.grouping.partition import improve, likeliest_cut
 from cluster_slam.records import IntArray
 
 _TOGETHER = 0.62  # share of a flower's frames that show its nearest, too: 0.7 to 0.97 of clusters, 0.37 to 0.55 of none
+_CLUSTER = 3  # members of what is certainly called a cluster
 _SURE = 3.0  # log-likelihood, 20 to 1, that there are clusters
 _REACH = 7.0  # spacings; flowers that far apart are of two clusters, whatever they do
 
@@ -95,13 +96,15 @@ def _come_in_clusters(places: Array, presence: csr_matrix, label: IntArray, like
     """Whether this session's flowers come in clusters at all.
 
     They do where they move as one, however seldom they are seen together; and where they are seen together and stand
-    nearer than flowers that are all loose would. The likeliest of all partitions is no worse than all loose by the way
-    it was found: it must be likelier for sure.
+    nearer than flowers that are all loose would. Plants have clusters, so the likeliest partition is believed where it
+    has some of three; pairs alone are often chance, and must be likelier for sure.
     """
-    clustered = likelihood.sums(members_by_label(label).values())
+    members = members_by_label(label)
+    clustered = likelihood.sums(members.values())
     if clustered.motion > _SURE:
         return True
-    if likelihood.of(clustered) - likelihood(np.arange(len(places))) < _SURE:
+    wanted = 0.0 if max(map(len, members.values())) >= _CLUSTER else _SURE
+    if likelihood.of(clustered) - likelihood(np.arange(len(places))) < wanted:
         return False
     nearest = np.asarray(cKDTree(places).query(places, k=2)[1])[:, 1]
     both = np.asarray(presence.multiply(presence[nearest]).sum(axis=1)).ravel()
