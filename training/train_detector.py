@@ -2,7 +2,7 @@
 
     python training/train_detector.py -o cluster_slam/detect/models/flowers.onnx
 
-Needs the extra ``train``. Everything is seeded; one thread; six minutes of CPU.
+Needs the extra ``train``. Everything is seeded; one thread; ten minutes of CPU.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ RATE = 4e-3
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("-o", "--out", type=Path, required=True)
-    options.add_argument("--worlds", type=int, default=80)
-    options.add_argument("--steps", type=int, default=1200)
+    options.add_argument("--worlds", type=int, default=120)
+    options.add_argument("--steps", type=int, default=2400)
     chosen = options.parse_args()
     torch.manual_seed(SEED)
     torch.set_num_threads(1)
