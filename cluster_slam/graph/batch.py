@@ -163,16 +163,15 @@ class BatchSmoother:
     def linearised(self, e: Estimate) -> Linearised:
         """The problem at an estimate, every observation weighted by its robust weight."""
         pairs, prior = self.pairs, self._pose_prior(e)
-        root = np.sqrt(e.weight[self.rows] / self.correlation)
-        A_z, A_l, r = self.whitened(e)
+        A_z, A_l, r = self._weighted(e)
         mean = np.zeros((len(pairs.stretch_sigma), 3)) if self._stretch_mean is None else self._stretch_mean
         within = pairs.stretch >= 0
         d = e.d.copy()
         d[within] -= mean[pairs.stretch[within]]
         return Linearised(
-            A_z=root[:, None, None] * A_z,
-            A_l=root[:, None, None] * A_l,
-            r=root[:, None] * r,
+            A_z=A_z,
+            A_l=A_l,
+            r=r,
             d=d,
             d_information=pairs.sigma**-2,
             b=mean,
