@@ -221,3 +221,28 @@ def test_wide_boxes_are_no_hidden_flowers() -> None:
     found = lift_boxes(camera, boxes, depth, convention="z", model=EXACT, sigma_px=np.ones(6), image=image)
     assert found.is_lifted.all()
     np.testing.assert_allclose(found.depths, 0.40, atol=1e-3)
+
+
+def test_a_flower_behind_another_is_not_at_its_depth() -> None:
+    """Three quarters of its box are the other's petals; what is left of its own says its depth, or there is none."""
+    v, u = np.mgrid[:100, :120]
+    depth = np.full((100, 120), 0.70)
+    depth[(u - 70) ** 2 + 4 * (v - 50) ** 2 <= 36] = 0.45
+    depth[(u - 60) ** 2 + (v - 50) ** 2 <= 169] = 0.40
+    boxes = ImageDetections(np.array([[60.0, 50.0], [70.0, 50.0]]), np.array([[26.0, 26.0], [12.0, 6.0]]), np.ones(2))
+    camera = Camera(430.0, 430.0, 60.0, 50.0, np.zeros(8), 120, 100)
+    found = lift_boxes(camera, boxes, depth, convention="z", model=EXACT, sigma_px=np.ones(2))
+    assert found.depths[0] == pytest.approx(0.40, abs=1e-3)
+    assert np.isnan(found.depths[1]) or found.depths[1] == pytest.approx(0.45, abs=1e-3)
+
+
+def test_flowers_side_by_side_both_have_their_depth() -> None:
+    """Their boxes overlap by a quarter; each keeps enough of its own."""
+    v, u = np.mgrid[:100, :120]
+    middles = np.array([[50.0, 50.0], [64.0, 50.0]])
+    depth = np.where(((u[..., None] - middles[:, 0]) ** 2 + (v[..., None] - 50) ** 2 <= 64).any(-1), 0.40, 0.70)
+    camera = Camera(430.0, 430.0, 60.0, 50.0, np.zeros(8), 120, 100)
+    boxes = ImageDetections(middles, np.full((2, 2), 17.0), np.ones(2))
+    found = lift_boxes(camera, boxes, depth, convention="z", model=EXACT, sigma_px=np.ones(2))
+    assert found.is_lifted.all()
+    np.testing.assert_allclose(found.depths, 0.40, atol=1e-3)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cluster_slam.geometry import Array
-from cluster_slam.lift.petals import NO_DEPTH, petal_depth
+from cluster_slam.lift.petals import NO_DEPTH, PetalDepth, petal_depth
 from cluster_slam.lift.points import Convention, lift_unscented
 from cluster_slam.records import BoolArray, ImageDetections
 from cluster_slam.sensors.camera import Camera
@@ -17,6 +17,7 @@ from cluster_slam.sensors.depth import DepthModel
 _ALIKE = 1.8  # flowers of one picture differ in width by less than this factor from the middle one
 _MIN_ALIKE = 5  # flowers that say what is usual
 _SEEN = 0.72  # share of a box that is petals with a depth; of half, one depth in five is of what hides the rest
+_DEEP = 0.3  # in widths: what is so near the plane of a flower's petals is theirs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,13 +61,7 @@ def lift_boxes(
         (h, w, 3) the colour picture, which helps to tell petals from what is before and behind; None: there is none.
     """
     focal = (camera.fx + camera.fy) / 2
-    table = np.column_stack([boxes.centres, boxes.sizes])
-    found = [
-        petal_depth(depth, box[:2], box[2:], focal, model, image, _reaching(table, k))
-        if box[2:].min() > 0
-        else NO_DEPTH
-        for k, box in enumerate(table)
-    ]
+    found = _petal_depths(np.column_stack([boxes.centres, boxes.sizes]), depth, focal, model, image)
     depths = np.array([f.depth for f in found])
     sigmas = np.array([f.sigma for f in found])
     slopes = np.array([(f.slope_u, f.slope_v) for f in found]).reshape(-1, 2)
@@ -87,6 +82,43 @@ def lift_boxes(
         )
     good &= np.isfinite(points).all(1)
     return LiftedBoxes(depths, sigmas, points, covs, good)
+
+
+def _petal_depths(
+    table: Array, depth: Array, focal_px: float, model: DepthModel, image: NDArray[np.uint8] | None
+) -> list[PetalDepth]:
+    """Depths of boxes (k, 4), those whose petals are seen best first: what is theirs is no other flower's.
+
+    Without that a flower behind another would be found at the other's depth, as its box holds more of the other's
+    petals than of its own.
+    """
+    others = [_reaching(table, k) for k in range(len(table))]
+    found = [
+        petal_depth(depth, box[:2], box[2:], focal_px, model, image, others[k]) if box[2:].min() > 0 else NO_DEPTH
+        for k, box in enumerate(table)
+    ]
+    left = depth.copy()
+    for k in np.argsort([-f.seen for f in found], kind="stable"):
+        box = table[k]
+        if not np.isfinite(found[k].depth) or not len(others[k]):
+            continue
+        found[k] = petal_depth(left, box[:2], box[2:], focal_px, model, image, others[k])
+        if np.isfinite(found[k].depth):
+            _take(left, box, found[k], focal_px)
+    return found
+
+
+def _take(left: Array, box: Array, petals: PetalDepth, focal_px: float) -> None:
+    """Leave no depth where a flower's petals are."""
+    low = np.maximum(np.floor(box[:2] - box[2:] / 2).astype(int), 0)
+    high = np.maximum(np.ceil(box[:2] + box[2:] / 2).astype(int) + 1, low)
+    patch = left[low[1] : high[1], low[0] : high[0]]
+    u = np.arange(low[0], low[0] + patch.shape[1]) - box[0]
+    v = (np.arange(low[1], low[1] + patch.shape[0]) - box[1])[:, None]
+    inside = (2 * u / box[2]) ** 2 + (2 * v / box[3]) ** 2 <= 1.0
+    plane = petals.depth + petals.slope_u * u + petals.slope_v * v
+    reach = _DEEP * np.sqrt(box[2] * box[3]) * petals.depth / focal_px
+    patch[inside & (np.abs(patch - plane) < reach)] = 0.0
 
 
 def _reaching(table: Array, k: int) -> Array:
