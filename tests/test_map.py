@@ -417,6 +417,9 @@ def test_check_finds_damage(tmp_path: Path) -> None:
         "not positive definite": "UPDATE clusters SET cov_xx = -1 WHERE id = 1",
         "outside 0 to 1": "UPDATE flowers SET presence = 2 WHERE id = 0",
         "journal is damaged": "UPDATE journal SET before = x'00'",
+        "a value cannot be read": "UPDATE sessions SET cov = '[1, 2'",
+        "alignment's covariance": "UPDATE sessions SET cov = replace(cov, '[', '[-1') WHERE id = 1",
+        "alignment is not finite": "UPDATE sessions SET tx = 1e999 WHERE id = 1",
     }
     with map_of(tmp_path, grown()) as store:
         assert problems(store) == []
@@ -427,6 +430,27 @@ def test_check_finds_damage(tmp_path: Path) -> None:
             assert any(words in text for text in problems(store)), words
             store.connection.execute("ROLLBACK TO d")
             store.connection.execute("RELEASE d")
+
+
+@pytest.mark.parametrize(
+    ("command", "damage"),
+    [
+        (["undo"], "UPDATE journal SET before = x'00'"),
+        (["undo"], "UPDATE journal SET before = 7"),
+        (["show"], "UPDATE sessions SET cov = '[1, 2'"),
+        (["report", "-o", "r.html"], "PRAGMA foreign_keys=OFF; UPDATE observations SET cluster_id = 9999"),
+    ],
+)
+def test_damage_that_sqlite_cannot_see_is_told(
+    command: list[str], damage: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with map_of(tmp_path, grown()) as store:
+        store.connection.executescript(damage)
+    assert run(["map", command[0], str(store.path), *command[1:]]) == 2
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    assert "is damaged" in said
 
 
 def test_a_map_without_its_end_is_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

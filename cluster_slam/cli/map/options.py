@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cluster_slam.cli.summary import print_json
-from cluster_slam.errors import ConfigError
+from cluster_slam.errors import ClusterSlamError, ConfigError, InputError
 
 if TYPE_CHECKING:
     from cluster_slam.io.map.store import MapStore
@@ -27,11 +27,24 @@ PlantOption = Annotated[
 
 @contextmanager
 def opened(path: Path) -> Iterator[MapStore]:
-    """A map, closed again at the end; what it takes to read one is imported only now."""
+    """A map, closed again at the end; what it takes to read one is imported only now.
+
+    Raises
+    ------
+    InputError
+        Something else went wrong, and the map turns out to be damaged.
+    """
     from cluster_slam.io.map import open_map
+    from cluster_slam.io.map.check import problems
 
     with open_map(path) as store:
-        yield store
+        try:
+            yield store
+        except (ValueError, TypeError, LookupError, ArithmeticError) as error:
+            found = [] if isinstance(error, ClusterSlamError) else problems(store)
+            if found:
+                raise InputError(f"{path}: is damaged ({found[0]}); `cluster-slam map check` says more") from error
+            raise
 
 
 def is_similarity(align: str) -> bool:

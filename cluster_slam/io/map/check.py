@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
-import zlib
 
 import numpy as np
 
 from cluster_slam.errors import InputError
+from cluster_slam.io.map.journal import unpacked
 from cluster_slam.io.map.store import MapStore
 
 _ORPHANS = (
@@ -67,11 +66,24 @@ def problems(store: MapStore) -> list[str]:
         for what, query in _ORPHANS:
             n = store.connection.execute(query).fetchone()[0]
             found += [f"{n} {what}"] if n else []
+        found += _sessions(store)
         found += _journals(store)
         for name in store.plant_names():
             found += _numbers(store, name)
     except (sqlite3.Error, InputError) as error:
         found.append(str(error))
+    except (ValueError, TypeError, LookupError) as error:
+        found.append(f"a value cannot be read ({error})")
+    return found
+
+
+def _sessions(store: MapStore) -> list[str]:
+    found = []
+    for session in store.sessions():
+        if not (np.isfinite(session.T_map_world).all() and np.isfinite(session.cov).all() and session.scale > 0):
+            found.append(f"session {session.session}: its alignment is not finite")
+        elif np.linalg.eigvalsh(session.cov)[0] < -1e-12:
+            found.append(f"session {session.session}: its alignment's covariance is not positive definite")
     return found
 
 
@@ -79,10 +91,8 @@ def _journals(store: MapStore) -> list[str]:
     found = []
     for session, before in store.connection.execute("SELECT session_id, before FROM journal"):
         try:
-            content = json.loads(zlib.decompress(before))
-        except (zlib.error, ValueError):
-            content = {}
-        if not {"plant", "clusters", "flowers"} <= set(content):
+            unpacked(before)
+        except ValueError:
             found.append(f"session {session} cannot be undone: its journal is damaged")
     return found
 

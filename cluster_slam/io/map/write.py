@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import sqlite3
-import zlib
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from cluster_slam.errors import InputError
 from cluster_slam.geometry import Array, tum_from_pose
+from cluster_slam.io.map.journal import packed, unpacked
 from cluster_slam.io.map.rows import N_CLUSTER_COLUMNS, N_FLOWER_COLUMNS, Row, cluster_rows, flower_rows
 from cluster_slam.io.map.store import MapStore, StoredSession
 from cluster_slam.records import BoolArray, Constellation, IntArray, PlantMap
@@ -60,8 +61,7 @@ def put(connection: sqlite3.Connection, entry: Entry) -> None:
     _observations(connection, entry, session_id)
     _count_up(connection, entry.plant)
     journal = {"plant": before, **{name: rows for name, (_, rows) in changed.items()}}
-    packed = zlib.compress(json.dumps(journal).encode(), 6)
-    connection.execute("INSERT INTO journal VALUES (?, ?)", (session_id, packed))
+    connection.execute("INSERT INTO journal VALUES (?, ?)", (session_id, packed(journal)))
     _prune(connection)
 
 
@@ -168,7 +168,7 @@ def undo(store: MapStore) -> StoredSession:
     Raises
     ------
     InputError
-        There is no session, it is too long ago, or an event was recorded against a cluster that it brought.
+        There is no session, it is too long ago or damaged, or an event was recorded against a cluster that it brought.
     """
     with store.write() as connection:
         sessions = store.sessions()
@@ -181,7 +181,7 @@ def undo(store: MapStore) -> StoredSession:
                 f"{store.path}: session {last.session!r} cannot be undone: "
                 "it is too long ago, came by a merge, or was optimised since"
             )
-        journal = json.loads(zlib.decompress(found[0]))
+        journal = _unpacked(store, last, found[0])
         _check_events(connection, store, last, [row[0] for row in journal["clusters"] if len(row) == 1])
         for table in ("journal", "observations", "flower_observations"):
             connection.execute(f"DELETE FROM {table} WHERE session_id = ?", (last.id,))
@@ -196,6 +196,14 @@ def undo(store: MapStore) -> StoredSession:
         else:
             _set_plant(connection, tuple(journal["plant"]))
     return last
+
+
+def _unpacked(store: MapStore, session: StoredSession, before: bytes) -> dict[str, Any]:
+    try:
+        return unpacked(before)
+    except ValueError:
+        text = f"is damaged (what session {session.session!r} changed cannot be read); nothing has changed"
+        raise InputError(f"{store.path}: {text}, `cluster-slam map check` says more") from None
 
 
 def _restore(connection: sqlite3.Connection, table: str, width: int, rows: list[list[object]]) -> None:
