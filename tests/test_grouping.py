@@ -9,7 +9,8 @@ from scipy.sparse import csr_matrix
 from cluster_slam.config import GroupingConfig
 from cluster_slam.geometry import Array
 from cluster_slam.grouping import Motion, group_flowers
-from cluster_slam.grouping.comotion import log_likelihood_ratio, motion_evidence, pair_ratios, turning_ratio
+from cluster_slam.grouping.comotion import Ratios, log_likelihood_ratio, motion_evidence, pair_ratios, turning_ratio
+from cluster_slam.grouping.lasting import lasting_share, without_lasting
 from cluster_slam.grouping.likelihood import Likelihood
 from cluster_slam.grouping.partition import improve
 
@@ -23,6 +24,21 @@ def motion_of(label: Array, amplitude: float, *, rng: np.random.Generator) -> Mo
     swing = [amplitude * np.sin(2 * np.pi * f * STAMPS[:, None] + rng.uniform(0, 6, 3)) for f in (0.9, 1.7)]
     u = np.stack([swing[j] for j in label], axis=1)
     return Motion(u + NOISE_M * rng.standard_normal(u.shape), np.full(u.shape[:2], NOISE_M**2), STAMPS)
+
+
+def ratios(ratio: list[float] | Array, sigma: float, n_stretches: list[float] | Array, lasting: float = 0.0) -> Ratios:
+    """Ratios (p,) that are equally well known."""
+    each = np.asarray(ratio, float)
+    return Ratios(each, np.full_like(each, sigma), np.asarray(n_stretches, float), np.full_like(each, lasting))
+
+
+def slow(shape: tuple[int, ...], last_s: float, *, rng: np.random.Generator) -> Array:
+    """Errors of variance one, (n, ...), whose correlation falls to 1 / e within ``last_s``."""
+    keep = np.exp(-(STAMPS[1] - STAMPS[0]) / last_s)
+    x = rng.standard_normal(shape)
+    for k in range(1, len(x)):
+        x[k] = keep * x[k - 1] + np.sqrt(1.0 - keep**2) * x[k]
+    return x
 
 
 def two_crossed_clusters() -> tuple[Array, Array]:
@@ -58,7 +74,7 @@ def test_no_motion_is_no_evidence() -> None:
 
 @pytest.mark.parametrize(("ratio", "sign"), [(0.0, 1.0), (0.02, 1.0), (0.6, -1.0), (1.0, -1.0)])
 def test_evidence_has_the_sign_of_what_was_seen(ratio: float, sign: float) -> None:
-    value = log_likelihood_ratio(np.array([ratio]), np.array([0.02]), np.array([4.0]), 0.0)[0]
+    value = log_likelihood_ratio(ratios([ratio], 0.02, [4.0]), 0.0)[0]
     assert sign * value > 1.5
 
 
@@ -66,20 +82,20 @@ def test_turning_is_read_off_near_pairs_and_grows_with_the_square_of_the_distanc
     rng = np.random.default_rng(29)
     distance = np.concatenate([rng.uniform(0.01, 0.05, 200), [0.08]])
     ratio = 40.0 * distance**2 + 0.005 * rng.standard_normal(201)
-    usual = turning_ratio(ratio, np.full(201, 0.005), distance, 0.05)
+    usual = turning_ratio(ratios(ratio, 0.005, np.full(201, 6.0)), distance, 0.05)
     np.testing.assert_allclose(usual, 40.0 * distance**2, rtol=0.1)
-    known, rigid = (
-        log_likelihood_ratio(ratio[-1:], np.array([0.005]), np.array([6.0]), t)[0] for t in (usual[-1:], 0.0)
-    )
+    known, rigid = (log_likelihood_ratio(ratios(ratio[-1:], 0.005, [6.0]), t)[0] for t in (usual[-1:], 0.0))
     assert known > 0.5 > -2.0 > rigid  # 0.26 apart is what a cluster that turns does over 8 cm
 
 
 def test_rigid_clusters_do_not_turn() -> None:
-    assert (turning_ratio(np.full(50, -0.01), np.full(50, 0.02), np.linspace(0.01, 0.08, 50), 0.05) == 0.0).all()
+    assert (
+        turning_ratio(ratios(np.full(50, -0.01), 0.02, np.full(50, 6.0)), np.linspace(0.01, 0.08, 50), 0.05) == 0.0
+    ).all()
 
 
 def test_a_poorly_known_ratio_says_little() -> None:
-    assert abs(log_likelihood_ratio(np.array([0.5]), np.array([2.0]), np.array([4.0]), 0.0)[0]) < 0.2
+    assert abs(log_likelihood_ratio(ratios([0.5], 2.0, [4.0]), 0.0)[0]) < 0.2
 
 
 def test_evidence_by_hand() -> None:
@@ -89,13 +105,12 @@ def test_evidence_by_hand() -> None:
     # N(0.015; 0, 0.002887) = 1.9e-4 * 0.0071429; and 5 % of anything: (1 / 2.8 + N(0.01; 0.5, 0.7)) / 2 = 0.40177
     apart = 0.7 * 0.08145 + 0.3 * 0.44067
     expected = np.log((0.95 * 17.603 + 0.05 * 0.40177) / (0.95 * apart + 0.05 * 0.40177))
-    value = log_likelihood_ratio(np.array([0.01]), np.array([0.0]), np.array([60 / 7]), 0.0)[0]
+    value = log_likelihood_ratio(ratios([0.01], 0.0, [60 / 7]), 0.0)[0]
     assert value == pytest.approx(expected, rel=1e-3)
 
 
 def test_moving_alike_again_and_again_is_stronger_evidence_than_once() -> None:
-    ratio, sigma = np.full(4, 0.01), np.full(4, 0.01)
-    evidence = log_likelihood_ratio(ratio, sigma, np.array([1.0, 3.0, 9.0, 27.0]), 0.0)
+    evidence = log_likelihood_ratio(ratios(np.full(4, 0.01), 0.01, [1.0, 3.0, 9.0, 27.0]), 0.0)
     assert (np.diff(evidence) > 0.2).all()
 
 
@@ -104,9 +119,60 @@ def test_ratio_of_one_cluster_is_zero_within_its_sigma() -> None:
     rng = np.random.default_rng(19)
     label = np.zeros(12, dtype=np.int64)
     pairs = np.column_stack(np.triu_indices(12, 1))
-    ratio, sigma, n_stretches = pair_ratios(pairs, motion_of(label, 3.0 * NOISE_M, rng=rng))
-    assert abs(np.mean(ratio / sigma)) < 0.4  # 66 pairs of 12 flowers: as good as 12 independent ones
-    assert (n_stretches > 20).all()  # 20 s of undamped motion: 50 stretches of 0.4 s
+    found = pair_ratios(pairs, motion_of(label, 3.0 * NOISE_M, rng=rng), 0.0)
+    assert abs(np.mean(found.ratio / found.sigma)) < 0.4  # 66 pairs of 12 flowers: as good as 12 independent ones
+    assert (found.n_stretches > 20).all()  # 20 s of undamped motion: 50 stretches of 0.4 s
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.4])
+def test_the_share_of_errors_that_last_is_found(share: float) -> None:
+    rng = np.random.default_rng(37)
+    places, label = rng.uniform(0, 0.5, (12, 3)), np.zeros(12, dtype=np.int64)
+    motion = motion_of(label, 0.02, rng=rng)
+    u = motion.u + np.sqrt(share) * NOISE_M * slow(motion.u.shape, 2.0, rng=rng)
+    moment = np.arange(N_FRAMES) // 12
+    found = lasting_share(places, u, motion.var, motion.var, moment)
+    assert found == pytest.approx(share, rel=0.25, abs=0.01)
+
+
+def test_what_stays_the_same_for_a_spell_is_subtracted_and_sway_is_not() -> None:
+    rng = np.random.default_rng(41)
+    constant = np.array([0.02, -0.01, 0.03])
+    motion = motion_of(np.array([0, 0, 1]), 0.01, rng=rng)
+    u, left = without_lasting(motion.u + constant, motion.var, STAMPS, 0.5)
+    inside = abs(STAMPS - STAMPS.mean()) < 0.5 * STAMPS[-1] - 1.0
+    assert abs(u[inside].mean(axis=(0, 1))).max() < 0.001
+    assert u[inside].std() == pytest.approx(motion.u[inside].std(), rel=0.15)
+    assert (left < motion.var).all()
+    unchanged, same = without_lasting(motion.u, motion.var, STAMPS, 0.0)
+    np.testing.assert_array_equal(unchanged, motion.u)
+    np.testing.assert_array_equal(same, motion.var)
+
+
+def test_noise_that_is_left_is_what_it_says() -> None:
+    rng = np.random.default_rng(43)
+    noise = NOISE_M * rng.standard_normal((N_FRAMES, 200, 3))
+    u, left = without_lasting(noise, np.full(noise.shape[:2], NOISE_M**2), STAMPS, 0.02)
+    np.testing.assert_allclose((u**2).mean(axis=(1, 2)), left[:, 0], rtol=0.3)
+    assert (u**2).mean() == pytest.approx(left.mean(), rel=0.01)
+
+
+def test_errors_that_last_part_no_cluster() -> None:
+    """Where a cluster hardly moves, views in which one flower errs look like a motion of its own."""
+    rng = np.random.default_rng(47)
+    places = np.repeat(np.array([[0.0, 0, 1], [0.2, 0, 1], [0, 0.2, 1], [0.2, 0.2, 1]]), 4, axis=0)
+    places = places + 0.02 * rng.standard_normal(places.shape)
+    motion = motion_of(np.zeros(16, dtype=np.int64), 0.0, rng=rng)
+    heavy = np.sqrt(0.1 * 4.0 / rng.chisquare(4.0, 16))  # of each flower, over the sigma of one observation
+    u = motion.u + NOISE_M * heavy[:, None] * slow(motion.u.shape, 1.5, rng=rng)
+    found = grouped(places, Motion(u, motion.var, STAMPS))
+    np.testing.assert_array_equal(found, np.repeat(np.arange(4), 4))
+
+
+def test_lasting_errors_of_unknown_size_leave_little_evidence() -> None:
+    sure, unsure = (log_likelihood_ratio(ratios([1.0], 0.05, [5.0], lasting), 0.0)[0] for lasting in (0.0, 0.3))
+    assert sure < -2.5
+    assert -1.0 < unsure < 0.0
 
 
 def test_improving_never_makes_it_less_likely() -> None:

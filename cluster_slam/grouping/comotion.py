@@ -8,6 +8,11 @@ is zero where they move as one and one where they move apart from each other; ne
 shook lie between. Frames in which the plant moves weigh most; how much it moved is read off the neighbouring frames,
 so that a frame's own noise does not choose it.
 
+Errors of a flower that last (``lasting``) look like a motion of its own. Their expectation is subtracted like that of
+the noise, and since they are larger for some flowers than for others, by an unknown factor whose inverse is chi-square
+distributed, the likelihood is the mean over that factor: where the motion that was seen is not clearly more than such
+errors may be, it says nothing, however many frames there are.
+
 Two clusters may swing alike for a moment, but hardly again and again. How often a pair was seen to move is the number
 of equal stretches that would hold as much motion, (sum e)^2 / sum e^2 over the motion e in each stretch (Kish, "Survey
 sampling", 1965); the more there are, the rarer a small ratio of two clusters.
@@ -16,7 +21,7 @@ sampling", 1965); the more there are, the rarer a small ratio of two clusters.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +30,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from cluster_slam.geometry import Array
+from cluster_slam.grouping.lasting import SPELL_S, lasting_share, without_lasting
 from cluster_slam.records import BoolArray, IntArray
 
 _WINDOW_S = 0.4  # motion hardly changes for so long
@@ -44,6 +50,12 @@ _MOST_TURNING = 0.3
 _ANYTHING = 0.05  # this share of all pairs has any ratio
 _RANGE = 1.4
 _BINS = 140  # of the range
+_LASTS = 3.0  # windows: as long a lasting error stays the same
+_ALIKE_DOF = 4.0  # flowers' lasting errors are alike as far as sample variances with so many degrees of freedom
+_N_FACTORS = 32  # equally probable ones of their usual variance
+_FACTORS = _ALIKE_DOF / chi2.ppf((np.arange(_N_FACTORS) + 0.5) / _N_FACTORS, _ALIKE_DOF)
+# Only moments that are significant are looked at: if it was errors, then large ones.
+_IF_SELECTED = chi2.sf(_SIGNIFICANT / _FACTORS, 3) / chi2.sf(_SIGNIFICANT / _FACTORS, 3).mean()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,37 +67,76 @@ class Motion:
     stamps: Array
 
 
+class Ratios(NamedTuple):
+    """Of pairs (p,); NaN where too little moved."""
+
+    ratio: Array
+    sigma: Array  # standard deviation
+    n_stretches: Array  # of motion
+    lasting: Array  # share of lasting errors in the denominator, if they are as large as usual
+
+
 def motion_evidence(places: Array, motion: Motion, reach: float) -> csr_matrix:
     """Log-likelihood ratios (l, l) that two flowers within ``reach`` move as one, against that they do not."""
     pairs = cKDTree(places).query_pairs(reach, output_type="ndarray")
     n = len(places)
     if len(pairs) == 0:
         return csr_matrix((n, n))
-    ratio, sigma, n_stretches = pair_ratios(pairs, motion)
-    known = sigma < _SURE
-    pairs, ratio, sigma, n_stretches = pairs[known], ratio[known], sigma[known], n_stretches[known]
+    motion, lasting = _less_lasting(places, motion)
+    ratios = pair_ratios(pairs, motion, lasting)
+    known = ratios.sigma < _SURE
+    pairs, ratios = pairs[known], Ratios(*(x[known] for x in ratios))
     if len(pairs) == 0:
         return csr_matrix((n, n))
     distance = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
-    evidence = log_likelihood_ratio(ratio, sigma, n_stretches, turning_ratio(ratio, sigma, distance, _NEAR * reach))
+    evidence = log_likelihood_ratio(ratios, turning_ratio(ratios, distance, _NEAR * reach))
     upper = csr_matrix((evidence, (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     return csr_matrix(upper + upper.T)
 
 
-def log_likelihood_ratio(ratio: Array, sigma: Array, n_stretches: Array, turning: Array | float) -> Array:
-    """Of ratios (p,) with standard deviations ``sigma``, from so many stretches of motion.
+def _less_lasting(places: Array, motion: Motion) -> tuple[Motion, float]:
+    """Without what stays the same for a spell, if errors do so; share of what still lasts for a stretch."""
+    u, var, spells = motion.u, motion.var, _stretches(motion.stamps, SPELL_S)
+    # Sway averages out over a spell: it is not taken for lasting errors, even where all neighbours move apart.
+    slow = lasting_share(places, u, var, var, spells)
+    if slow == 0.0:
+        return motion, 0.0
+    u, left = without_lasting(u, var, motion.stamps, slow)
+    return Motion(u, left, motion.stamps), min(slow, lasting_share(places, u, var, left, _stretches(motion.stamps)))
 
-    ``turning`` is the usual ratio of such a pair within a cluster that turns.
-    """
+
+def log_likelihood_ratio(ratios: Ratios, turning: Array | float) -> Array:
+    """Of ratios (p,), where ``turning`` is the usual ratio of such a pair within a cluster that turns."""
+    if not ratios.lasting.any():
+        alike, other = _densities(ratios, turning)
+        return np.asarray(np.log(alike / other))
+    together, apart = np.zeros_like(ratios.ratio), np.zeros_like(ratios.ratio)
+    for factor, selected in zip(_FACTORS, _IF_SELECTED, strict=True):
+        given, left = _given_lasting(ratios, float(factor))
+        alike, other = _densities(given, turning)
+        together, apart = together + selected * alike / left, apart + other / left
+    return np.asarray(np.log(together / apart))
+
+
+def _given_lasting(ratios: Ratios, factor: float) -> tuple[Ratios, Array]:
+    """The ratios if lasting errors have ``factor`` times their usual variance; share of motion that is left (p,)."""
+    more = (factor - 1.0) * ratios.lasting
+    left = np.maximum(1.0 - more, np.minimum(ratios.sigma / _SURE, 1.0))
+    # Of squares of errors (chi-square) and of their product, over as many axes and independent stretches as there are.
+    fluctuation = factor * ratios.lasting * np.sqrt(3.0 / np.maximum(3.0 / _LASTS * ratios.n_stretches, 3.0))
+    sigma = np.hypot(ratios.sigma, fluctuation) / left
+    return Ratios((ratios.ratio - more) / left, sigma, ratios.n_stretches, ratios.lasting), left
+
+
+def _densities(ratios: Ratios, turning: Array | float) -> tuple[Array, Array]:
+    """Of the ratios (p,) of two flowers of one cluster, and of two clusters."""
+    ratio, sigma = ratios.ratio, ratios.sigma
     together = _normal(ratio, 0.5 * turning, np.hypot(sigma, _RIGID + turning))
     apart = _normal(ratio, _APART[0], np.hypot(sigma, _APART[1]))
-    apart = (1.0 - _ALIKE) * apart + _ALIKE * _anywhere(ratio, sigma, _POWER[0] + _POWER[1] * n_stretches)
+    apart = (1.0 - _ALIKE) * apart + _ALIKE * _anywhere(ratio, sigma, _POWER[0] + _POWER[1] * ratios.n_stretches)
     anything = np.where(np.abs(ratio) < _RANGE, 1.0, 0.0) / (2.0 * _RANGE) + _normal(ratio, 0.5, 0.5 * _RANGE + sigma)
-    anything = 0.5 * anything
-    value: Array = np.log(
-        ((1.0 - _ANYTHING) * together + _ANYTHING * anything) / ((1.0 - _ANYTHING) * apart + _ANYTHING * anything)
-    )
-    return value
+    anything = 0.5 * _ANYTHING * anything
+    return (1.0 - _ANYTHING) * together + anything, (1.0 - _ANYTHING) * apart + anything
 
 
 def _anywhere(x: Array, sigma: Array, power: Array) -> Array:
@@ -98,11 +149,12 @@ def _anywhere(x: Array, sigma: Array, power: Array) -> Array:
     return value
 
 
-def turning_ratio(ratio: Array, sigma: Array, distance: Array, near: float) -> Array:
+def turning_ratio(ratios: Ratios, distance: Array, near: float) -> Array:
     """Usual ratio (p,) of two flowers of one cluster at ``distance`` (p,) m: clusters turn as they sway.
 
     It grows with the square of the distance; by how much is said by pairs within ``near`` m, mostly of one cluster.
     """
+    ratio, sigma = ratios.ratio, ratios.sigma
     tell = np.flatnonzero((sigma < _TELLS) & (distance < near))
     if len(tell) < _FEWEST_PAIRS:
         return np.zeros_like(ratio)
@@ -118,11 +170,11 @@ def _normal(x: Array, mean: float | Array, sigma: Array) -> Array:
     return value
 
 
-def pair_ratios(pairs: NDArray[Any], motion: Motion) -> tuple[Array, Array, Array]:
-    """Ratios (p,) of pairs (p, 2), standard deviations (p,), stretches of motion (p,); NaN where too little moved."""
+def pair_ratios(pairs: NDArray[Any], motion: Motion, lasting: float) -> Ratios:
+    """Of pairs (p, 2), where ``lasting`` times the variance of an observation is that of errors that last."""
     seen = np.isfinite(motion.var)
-    power = _power(motion, seen)
-    stretch = np.floor((motion.stamps - motion.stamps[0]) / _WINDOW_S).astype(np.int64)
+    power = _power(motion, seen, lasting)
+    stretch = _stretches(motion.stamps)
     sums = np.full((6, len(pairs)), np.nan)
     for i, (f, g) in enumerate(pairs.tolist()):
         signal = power[:, f] + power[:, g]
@@ -131,12 +183,18 @@ def pair_ratios(pairs: NDArray[Any], motion: Motion) -> tuple[Array, Array, Arra
             noise = motion.var[k, f] + motion.var[k, g]
             sums[:, i] = _pair_sums(motion.u[k, f], motion.u[k, g], noise, signal[k], stretch[k] - stretch[k[0]])
     different, moved, noise_sq, noise_fourth, stretches, kept = sums
-    total = moved - noise_sq
+    total = moved - (1.0 + lasting) * noise_sq
     total[~(total > 0.0)] = np.nan
     # Of noise alone, whose squares are chi-square, those that are not the largest are smaller than the mean.
     left = chi2.cdf(chi2.ppf(kept, 3), 5) / kept
     sigma: Array = np.hypot(np.sqrt(6.0 * noise_fourth), _SYSTEMATIC * noise_sq) / total
-    return (different - left * noise_sq) / total, sigma, stretches
+    return Ratios((different - (left + lasting) * noise_sq) / total, sigma, stretches, lasting * noise_sq / total)
+
+
+def _stretches(stamps: Array, length_s: float = _WINDOW_S) -> IntArray:
+    """In which stretch each frame (n,) is."""
+    index: IntArray = np.floor((stamps - stamps[0]) / length_s).astype(np.int64)
+    return index
 
 
 def _pair_sums(u_f: Array, u_g: Array, noise: Array, signal: Array, stretch: IntArray) -> tuple[float, ...]:
@@ -157,19 +215,21 @@ def _pair_sums(u_f: Array, u_g: Array, noise: Array, signal: Array, stretch: Int
     return (*map(float, sums), len(kept) / len(noise))
 
 
-def _power(motion: Motion, seen: BoolArray) -> Array:
+def _power(motion: Motion, seen: BoolArray, lasting: float) -> Array:
     """How far each flower (n, l) stood from rest around each frame, m^2 along any axis, from the other frames alone."""
     stamps = motion.stamps
     dt = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
     half = max(1, round(0.5 * _WINDOW_S / dt))
     information: Array = np.where(seen, 1.0 / np.where(seen, motion.var, 1.0), 0.0)
     total = _others(information, half)
-    noise: Array = 1.0 / np.where(_others(1.0 * seen, half) > 0.5, total, np.inf)
+    n_others = _others(1.0 * seen, half)
+    noise: Array = 1.0 / np.where(n_others > 0.5, total, np.inf)
+    uncertain = noise * (1.0 + lasting * n_others)
     u: Array = np.where(seen[..., None], motion.u, 0.0)
     square = np.zeros_like(total)
     for axis in range(3):
         square += (noise * _others(information * u[..., axis], half)) ** 2
-    power: Array = np.where((noise > 0.0) & (square > _SIGNIFICANT * noise), square / 3.0 - noise, 0.0)
+    power: Array = np.where((noise > 0.0) & (square > _SIGNIFICANT * uncertain), square / 3.0 - uncertain, 0.0)
     return power
 
 

@@ -1,0 +1,105 @@
+"""Errors of a flower that last: they look like a motion of its own, and no number of frames averages them away.
+
+A detector's box and a camera's depth err with the direction that a flower is seen from, and with the leaf before it;
+both change slowly as the camera moves. How large such errors are, as a share of the stated variance of one observation,
+is read off the flowers' nearest neighbours, most of which belong to the same cluster and do not move away from each
+other: the difference of two such flowers, averaged over a moment, should be as small as the number of its frames says.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.stats import chi2
+
+from cluster_slam.geometry import Array
+from cluster_slam.records import IntArray
+
+_FEWEST = 2  # frames of a moment
+_MEDIAN = float(chi2.ppf(0.5, 3))
+_LARGEST = 100.0  # of the variance of an observation
+_STEPS = 40  # of a bisection
+SPELL_S = 2.0  # half of a turn about a plant takes longer, a period of sway does not
+_TAIL = 10.0  # as many times its usual variance a lasting error may have
+_LEFT = 0.5  # of the noise of one observation
+
+
+class Moments(NamedTuple):
+    """Differences of neighbours, averaged over moments (k,): squared, over the mean variance of one frame."""
+
+    square: Array
+    expected: Array  # of noise alone, along an axis
+
+
+def lasting_share(places: Array, u: Array, var: Array, left: Array, moment: IntArray) -> float:
+    """Variance of the errors that last for a moment, over the variance of one observation.
+
+    Flowers at ``places`` (l, 3) were displaced by ``u`` (n, l, 3) with noise ``var`` (n, l), of which ``left`` (n, l)
+    is left where something was subtracted from u; ``moment`` (n,) of each frame. The median over all moments of all
+    pairs does not mind the moments in which neighbours do move apart.
+    """
+    moments = _moments(places, u, var, left, moment)
+    low, high = 0.0, _LARGEST
+    if len(moments.square) == 0 or _median(moments, low) <= _MEDIAN:
+        return 0.0
+    for _ in range(_STEPS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _median(moments, middle) > _MEDIAN else (low, middle)
+    return 0.5 * (low + high)
+
+
+def _median(moments: Moments, share: float) -> float:
+    return float(np.median(moments.square / (moments.expected + share)))
+
+
+def _moments(places: Array, u: Array, var: Array, left: Array, moment: IntArray) -> Moments:
+    """Of each flower and its nearest."""
+    nearest = np.asarray(cKDTree(places).query(places, k=2)[1])[:, 1]
+    pairs = np.unique(np.sort(np.column_stack([np.arange(len(places)), nearest]), axis=1), axis=0)
+    found = [
+        _moments_of(u[:, f] - u[:, g], var[:, f] + var[:, g], left[:, f] + left[:, g], moment)
+        for f, g in pairs.tolist()
+    ]
+    return Moments(*(np.concatenate(x) for x in zip(*found, strict=True)))
+
+
+def _moments_of(difference: Array, var: Array, left: Array, moment: NDArray[np.int64]) -> Moments:
+    k = np.flatnonzero(np.isfinite(left))
+    weight, of = 1.0 / var[k], moment[k]
+    n_frames = np.bincount(of).astype(float)
+    enough = n_frames >= _FEWEST
+    information = np.bincount(of, weight)[enough]
+    # A mean over a spell, subtracted, takes as large a part of the moment's noise as of all its frames together.
+    kept = np.maximum(1.0 - np.bincount(of, 1.0 - left[k] / var[k])[enough], _LEFT)
+    n_frames = n_frames[enough]
+    mean = np.stack([np.bincount(of, weight * difference[k, a])[enough] for a in range(3)]) / information
+    return Moments((mean**2).sum(axis=0) * information / n_frames, kept / n_frames)
+
+
+def without_lasting(u: Array, var: Array, stamps: Array, share: float) -> tuple[Array, Array]:
+    """Displacements ``u`` (n, l, 3) less what stays the same for a spell, and their noise ``var`` (n, l).
+
+    Sway has returned by then, so that its mean over a spell is nothing. An error that lasts has ``share`` times the
+    variance of one observation, or many times that: as far as it can be told from noise it is removed.
+    """
+    seen = np.isfinite(var)
+    information = np.where(seen, 1.0 / np.where(seen, var, 1.0), 0.0)
+    first = np.searchsorted(stamps, stamps - 0.5 * SPELL_S)
+    last = np.searchsorted(stamps, stamps + 0.5 * SPELL_S, side="right")
+
+    def over_spell(x: Array) -> Array:
+        total = np.concatenate([np.zeros_like(x[:1]), np.cumsum(x, axis=0)])
+        summed: Array = total[last] - total[first]
+        return summed
+
+    known, n = over_spell(information), over_spell(1.0 * seen)
+    known[~seen] = 1.0
+    told = _TAIL * share * n / (1.0 + _TAIL * share * n)
+    mean = over_spell(information[..., None] * np.where(seen[..., None], u, 0.0)) / known[..., None]
+    own = information / known
+    left: Array = var * (1.0 - told * own * (2.0 - told))
+    kept = seen & (left > _LEFT * np.where(seen, var, np.inf))
+    return np.where(kept[..., None], u - told[..., None] * mean, np.nan), np.where(kept, left, np.nan)
