@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cluster_slam.geometry import Array, skew
-from cluster_slam.records import IntArray, Observations
+from cluster_slam.records import BoolArray, IntArray, Observations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,6 +34,18 @@ class Frames:
     def of(self, i: int) -> slice:
         """The observations of frame i."""
         return slice(int(self.starts[i]), int(self.starts[i + 1]))
+
+    def only(self, which: BoolArray) -> Frames:
+        """The same with some of the observations (m,), in all frames."""
+        frame = self.frame[which]
+        return Frames(
+            order=self.order[which],
+            starts=np.searchsorted(frame, np.arange(self.n_frames + 1)),
+            frame=frame,
+            points=self.points[which],
+            covs=self.covs[which],
+            stamps=self.stamps,
+        )
 
     def reversed(self) -> Frames:
         """The same session played backwards (frame n - 1 first); time runs from zero again."""

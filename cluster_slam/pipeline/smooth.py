@@ -13,6 +13,7 @@ from cluster_slam.config import SmoothConfig
 from cluster_slam.graph.noise import pose_model
 from cluster_slam.graph.poses import PoseModel
 from cluster_slam.records import Result, Session
+from cluster_slam.smoothing.again import follow_joined, learn_errors, same_noise
 from cluster_slam.smoothing.finish import make_result
 from cluster_slam.smoothing.first import first_world
 from cluster_slam.smoothing.rounds import (
@@ -56,6 +57,7 @@ def smooth(
     say("calibrating", 0.0)
     world = first_world(stated, stated_poses, config, rng)
     stated, stated_poses = corrected(stated, stated_poses, world.instruments)
+    noise_stated = world.noise
     clock.lap("landmarks")
     merged: list[tuple[int, int]] = []
     if world.cov_step is None:  # where drift was followed, the association has been made with it
@@ -68,13 +70,18 @@ def smooth(
     before = world.landmark
     if world.cov_step is None and not world.errs_slowly:
         world = settle(frames, world, smoother, estimate)
-    claimed = world.landmark != before
+    claimed, noise = world.landmark != before, world.noise
     world = let_all_stand(frames, learn(world, smoother, estimate), config)
     drifts = world.cov_step is not None
     for i in range(config.max_rounds):
         grouped = world if drifts else regroup(frames, world, config, rng, claimed)
         if i > 0 and same_groups(world, grouped):
             break
+        if i == 0 and not drifts:
+            joined = follow_joined(frames, model, grouped, world.cluster, config)
+            if joined is not grouped or not same_noise(noise, world.noise):
+                joined = drop_unsupported(stated, joined, config)
+                grouped = learn_errors(stated, stated_poses, joined, noise_stated, config)
         world = grouped
         frames, model = for_solving(stated, stated_poses, world)
         smoother, estimate = solve(frames, model, world, config, 2, in_stretches=True)
@@ -113,9 +120,11 @@ def _associate_and_smooth(
             world = replace(world, errs_slowly=observations_err_slowly(frames, model, world))
         smoother, estimate = solve(frames, model, world, config, 2)
         world = learn(world, smoother, estimate)
-        world = regroup(frames, world, config, rng)
+        before_groups, world = world.cluster, regroup(frames, world, config, rng)
         clock.lap("smoothing")
         if is_last:
+            world = follow_joined(frames, model, world, before_groups, config)
+            clock.lap("association")
             break
         world, new = mend(frames, model, world, estimate, smoother.pairs, config)
         merged += new

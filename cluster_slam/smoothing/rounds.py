@@ -26,7 +26,7 @@ from cluster_slam.graph.noise import camera_covs
 from cluster_slam.graph.poses import PoseModel
 from cluster_slam.graph.variance import errs_slowly
 from cluster_slam.grouping import Motion, group_flowers
-from cluster_slam.records import BoolArray
+from cluster_slam.records import BoolArray, IntArray
 from cluster_slam.smoothing.displaced import Displaced, taken_by_poses
 from cluster_slam.smoothing.stretches import at_rest, beyond_rest, standing_still, stretches
 from cluster_slam.smoothing.world import NO_WEIGHT, World, fewest_observations, scalar_var
@@ -36,7 +36,15 @@ LEAST_WILD = 0.001  # share of wild errors that is always reckoned with
 
 
 def associate(frames: Frames, model: PoseModel, world: World, config: SmoothConfig) -> World:
-    """Follow the clusters forwards and backwards; each frame of each cluster takes the better of the two."""
+    """Follow the clusters; flowers that were never found are left out."""
+    landmark = followed(frames, model, world, config)
+    keep = np.bincount(landmark[landmark >= 0], minlength=len(world.places)) > 0
+    _, cluster = np.unique(world.cluster[keep], return_inverse=True)
+    return replace(world, landmark=compact(keep, landmark), places=world.places[keep], cluster=cluster)
+
+
+def followed(frames: Frames, model: PoseModel, world: World, config: SmoothConfig) -> IntArray:
+    """Flower (m,) of each observation, -1 none: each frame of each cluster takes the better of both directions."""
     cov, _ = camera_covs(model, world.X)
     false = max(int((world.landmark < 0).sum()), 1) / max(frames.n_frames, 1) / view_volume(frames)
     follower = Follower(frames, world.T, cov, world.places, world.cluster, false, config.follow)
@@ -48,9 +56,7 @@ def associate(frames: Frames, model: PoseModel, world: World, config: SmoothConf
             frames, world.T, world.places, world.cluster, landmark, agree, REST_SIGMA_M, config.follow.gate_chi2
         )
         landmark = np.where(alone, -1, landmark)
-    keep = np.bincount(landmark[landmark >= 0], minlength=len(world.places)) > 0
-    _, cluster = np.unique(world.cluster[keep], return_inverse=True)
-    return replace(world, landmark=compact(keep, landmark), places=world.places[keep], cluster=cluster)
+    return landmark
 
 
 def let_all_stand(frames: Frames, world: World, config: SmoothConfig) -> World:
