@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from time import process_time
 
 import numpy as np
 from oracle import smooth_with_truth
+from scipy.ndimage import maximum_filter1d
 
 from cluster_slam import evaluate, smooth
 from cluster_slam.evaluation import Metrics
+from cluster_slam.evaluation.landmarks import flower_errors, matched_rest
+from cluster_slam.geometry import Array
+from cluster_slam.records import Result
 from cluster_slam.simulate import PRESETS, Simulated, simulate_session
+from tracking.metrics import identity_scores
+
+_HALF_SWING_S = 0.4
+_SWAYED_M = 0.002  # seven times what moves at all times
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,18 +34,21 @@ class Run:
     seconds: float
     n_observations: int
     noise_ratio: dict[str, float]  # estimated over true standard deviation
+    nees_swayed: Array  # of each flower that was seen only while it swayed, over its dimension
 
 
 @cache
-def run(preset: str, seed: int) -> Run:
+def run(preset: str, seed: int, duration_s: float | None = None) -> Run:
     """Simulate, smooth and evaluate; each world and seed only once."""
-    made = simulate_session(PRESETS[preset], seed=seed)
+    usual = PRESETS[preset]
+    made = simulate_session(usual if duration_s is None else replace(usual, duration_s=duration_s), seed=seed)
     begin = process_time()
     result = smooth(made.session)
     seconds = process_time() - begin
     metrics = evaluate(result, made.session, made.truth)
     ratio = _noise_ratio(made, result.diagnostics.estimated_noise)
-    return Run(preset, seed, result.status, metrics, seconds, len(made.session.observations), ratio)
+    n = len(made.session.observations)
+    return Run(preset, seed, result.status, metrics, seconds, n, ratio, _nees_swayed(made, result))
 
 
 @cache
@@ -53,6 +64,23 @@ def _noise_ratio(made: Simulated, estimated: dict[str, float]) -> dict[str, floa
     names = ["pose_translation", "pose_rotation", "flower"]
     stated = made.session.noise
     return {name: estimated[name] * factor / getattr(stated, name) for name in names if name in estimated}
+
+
+def _nees_swayed(made: Simulated, result: Result) -> Array:
+    """NEES over its dimension of flowers all of whose observations were made within half a swing of 2 mm or more."""
+    truth = made.truth
+    assert truth.flower_ids is not None
+    reach = 2 * round(_HALF_SWING_S * made.config.fps) + 1
+    swayed = maximum_filter1d(np.linalg.norm(made.motion.displacements, axis=-1), reach, axis=0) > _SWAYED_M
+    real = np.flatnonzero((truth.flower_ids >= 0) & (result.flower_ids >= 0))
+    cluster = made.plant.flower_cluster[truth.flower_ids[real]]
+    calm = ~swayed[made.session.observations.frame[real], cluster]
+    seen_calm = np.bincount(result.flower_ids[real], calm, minlength=int(result.flowers.ids.max(initial=-1)) + 1)
+    errors = flower_errors(
+        result.flowers, matched_rest(result.flowers, identity_scores(truth.flower_ids, result.flower_ids), truth)
+    )
+    only: Array = errors.nees[seen_calm[result.flowers.ids[errors.index]] == 0]
+    return only
 
 
 def runs(preset: str, seeds: Sequence[int]) -> list[Run]:
