@@ -60,8 +60,12 @@ class ParticleConfig:
     calibrate: bool = True  # clocks that differ and depths taken for ranges are found and corrected first
     gap_steps: float = 25.0  # usual steps without a point after which a map of its own begins ...
     fewest_points: int = 30  # ... if so many points are seen before the next one
-    n_motions: int = 12  # that are tried in a gap, beside what odometry says
-    submap_slack: float = 3.0  # sigmas of places are taken times this when maps are compared: they are bent, too
+    n_motions: int = 80  # in a gap that are tried as the beginning of a joint match, beside what odometry says
+    n_maps: int = 3  # of what lies between two gaps, drawn independently
+    n_ways: int = 16  # of joining two maps that are smoothed before they are compared
+    n_wholes: int = 4  # joined maps that are carried along until later points decide ...
+    lead: float = 100.0  # ... if they cost at most so much more than the best, in chi-square
+    submap_slack: float = 2.0  # sigmas of places are taken times this when maps are compared: they are bent, too
     n_particles: int = 60  # for a stretch; twice as many after a gap
     n_tries: int = 3  # of a stretch after a gap; the best is kept
     stretch_points: int = 100  # points that are associated before all is smoothed again

@@ -8,11 +8,21 @@ import numpy as np
 import pytest
 
 from cluster_slam.association.calibration import Calibration, calibrate, delayed, follow_points, pairs_of
+from cluster_slam.association.compatibility import match_jointly
 from cluster_slam.association.drift_smoother import Steps
 from cluster_slam.association.frames import Frames, sort_by_frame
-from cluster_slam.association.submaps import Part, joined, matched, motions, spans_between_gaps, window
+from cluster_slam.association.submaps import (
+    Part,
+    gap_cov,
+    identified,
+    joined,
+    motions,
+    sides,
+    spans_between_gaps,
+    window,
+)
 from cluster_slam.config import ParticleConfig
-from cluster_slam.geometry import Array, inverse, se3_exp, transform
+from cluster_slam.geometry import Array, inverse, se3_exp, se3_log, transform
 from cluster_slam.records import IntArray, Observations
 
 _PLACES = np.array([[2.0, 0, 3.0], [2.6, 0, 3.3], [-2.0, 0, 3.0], [0.0, 0, -3.0], [3.0, 0, -1.0], [-3.0, 0, -1.0]])
@@ -144,27 +154,41 @@ def _two_parts(z: Array) -> tuple[Part, Part, Steps, Array]:
     return a, b, steps, true
 
 
+def _matched(a: Part, b: Part, steps: Steps) -> Part:
+    """Part b joined to part a by the likeliest of the joint matches."""
+    n = 3 * len(_PLACES)
+    both, prior = sides(a, b, (np.zeros((n, n)), np.zeros((n, n))), steps), gap_cov(a, b, steps)
+    starts = motions(*both, prior, steps.basis, 20)
+    np.testing.assert_allclose(starts[0].z, 0.0)
+    best = max((match_jointly(*both, s, prior, steps.basis, 3.0) for s in starts), key=lambda match: match.score)
+    return identified(joined(a, b, best.z, steps), a, best.pairs)
+
+
 @pytest.mark.parametrize("z", [np.zeros(3), np.array([0.4, -0.8, 0.6]), np.array([-0.5, 0.3, 1.2])])
 def test_motion_in_a_gap_is_found_from_the_landmarks(z: Array) -> None:
     a, b, steps, true = _two_parts(z)
-    found = motions(a, b, steps, 5)
-    np.testing.assert_allclose(found[0], 0.0)
-    nearest = found[np.linalg.norm(found - z, axis=1).argmin()]
-    np.testing.assert_allclose(nearest, z, atol=0.02)
-    whole = matched(joined(a, b, nearest, steps), len(a.places))
+    whole = _matched(a, b, steps)
     np.testing.assert_array_equal(whole.label, np.tile(np.arange(len(_PLACES)), 4))
     np.testing.assert_allclose(whole.T, true, atol=0.02)
 
 
 def test_the_part_before_is_joined_like_the_part_after() -> None:
-    z = np.array([0.4, -0.8, 0.6])
-    a, b, steps, _ = _two_parts(z)
-    found = motions(b, a, steps, 5)
-    tries = [matched(joined(b, a, y, steps), len(b.places)) for y in found]
-    best = max(tries, key=lambda part: int((part.label < len(_PLACES)).sum()))
+    a, b, steps, _ = _two_parts(np.array([0.4, -0.8, 0.6]))
+    best = _matched(b, a, steps)
     assert (best.first, best.end, len(best.T)) == (0, 4, 4)
     np.testing.assert_array_equal(best.label, np.tile(np.arange(len(_PLACES)), 4))
     np.testing.assert_allclose(inverse(best.T[1]) @ best.T[2], _true_gap(), atol=0.03)
+
+
+def test_covariance_in_a_gap_is_the_same_from_either_side() -> None:
+    """Where b stands beside a, drawn through the gap forwards and backwards."""
+    a, b, steps, _ = _two_parts(np.zeros(3))
+    rng = np.random.default_rng(0)
+    drawn = steps.motion[1] @ se3_exp(1e-3 * rng.standard_normal((20_000, 3)) * [0.3, 1.0, 1.0] @ steps.basis.T)
+    forwards = se3_log(inverse(steps.motion[1]) @ drawn) @ steps.basis
+    backwards = se3_log(steps.motion[1] @ inverse(drawn)) @ steps.basis
+    np.testing.assert_allclose(1e6 * np.cov(forwards.T), gap_cov(a, b, steps), atol=0.04)
+    np.testing.assert_allclose(1e6 * np.cov(backwards.T), gap_cov(b, a, steps), atol=0.08)
 
 
 def _true_gap() -> Array:

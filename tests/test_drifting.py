@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cluster_slam.association.drift_labels import Labelling, choice_cost
+from cluster_slam.association.drift_joining import assemble
+from cluster_slam.association.drift_labels import Labelling, View
+from cluster_slam.association.drift_session import DriftSession
 from cluster_slam.association.drift_smoother import DriftSmoother, steps_of
 from cluster_slam.association.drifting import needs_tracing, trace_drifting
 from cluster_slam.association.frames import Frames, sort_by_frame
@@ -103,11 +105,35 @@ def test_poses_that_hardly_drift_are_kept(world: _World) -> None:
     assert not needs_tracing(world.frames, world.given, 1e-4 * world.cov_step)
 
 
+def _standing(places: Array, n: int) -> tuple[Labelling, Array]:
+    """A vehicle that stands still and sees one point a frame; its poses (n, 4, 4)."""
+    points = np.tile([0.0, 0.0, 3.0], (n, 1))
+    observations = Observations(np.arange(n), points, np.tile(1e-4 * np.eye(3), (n, 1, 1)), np.full(n, np.nan))
+    frames, T = sort_by_frame(observations, 0.25 * np.arange(n)), np.tile(np.eye(4), (n, 1, 1))
+    config = ParticleConfig()
+    steps = steps_of(T, np.tile(np.diag(_STEP**2), (n - 1, 1, 1)), frames.stamps, config)
+    view = View.of(np.array([[-1.0, -0.1, 3.0], [1.0, 0.1, 3.0]]))
+    return Labelling(frames, steps, config, view), T
+
+
 def test_choice_between_landmarks_costs_what_it_tells() -> None:
-    assert choice_cost(np.zeros(50, dtype=np.int64)) == 0.0
-    assert choice_cost(np.array([0, 1] * 20 + [-1] * 7)) == pytest.approx(2.0 * 40 * np.log(2.0))
-    three_to_one = 2.0 * (3 * np.log(4.0 / 3.0) + np.log(4.0))
-    assert choice_cost(np.array([2, 2, 2, 5])) == pytest.approx(three_to_one)
+    places = np.array([[0.0, 0.0, 3.0], [0.2, 0.0, 3.0]])
+    labels, T = _standing(places, 48)
+    assert labels.choice_cost(T, places, np.zeros(48, dtype=np.int64)) == 0.0
+    half = np.array([0, 1] * 20 + [-1] * 8)
+    assert labels.choice_cost(T, places, half) == pytest.approx(2.0 * 40 * np.log(2.0))
+    three_to_one = np.array([0, 0, 0, 1] + [-1] * 44)
+    assert labels.choice_cost(T, places, three_to_one) == pytest.approx(2.0 * (3 * np.log(4.0 / 3.0) + np.log(4.0)))
+
+
+def test_landmarks_out_of_view_are_no_choice() -> None:
+    """Where a landmark can be seen, others that stand behind the vehicle make it no less likely."""
+    places = np.array([[0.0, 0.0, 3.0], [0.0, 0.0, -3.0]])
+    labels, T = _standing(places, 40)
+    T = T.copy()
+    T[20:, [0, 2], [0, 2]] = -1.0  # about y by half a turn
+    label = np.repeat([0, 1], 20)
+    assert labels.choice_cost(T, places, label) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_one_landmark_split_in_two_is_put_together(world: _World) -> None:
@@ -125,3 +151,31 @@ def test_one_landmark_split_in_two_is_put_together(world: _World) -> None:
     assert len(split.places) == len(_PLACES) + 1
     assert len(merged.places) == len(_PLACES)
     assert merged.cost < split.cost
+
+
+def test_several_wholes_are_carried_over_a_gap() -> None:
+    """Half of the way unseen in its middle: both parts are mapped and joined, and every landmark is there once."""
+    world = _World(4, 200)
+    kept = (world.frames.stamps < 20.0) | (world.frames.stamps > 28.0)
+    rows = kept[world.frames.frame]
+    number = np.cumsum(kept) - 1
+    observations = Observations(
+        number[world.frames.frame[rows]],
+        world.frames.points[rows],
+        world.frames.covs[rows],
+        np.full(int(rows.sum()), np.nan),
+    )
+    frames = sort_by_frame(observations, world.frames.stamps[kept])
+    config = ParticleConfig(n_particles=30, n_maps=2, n_motions=8, n_ways=4)
+    gaps = np.diff(np.flatnonzero(kept))[:, None, None]
+    steps = steps_of(world.given[kept], world.cov_step[0] * gaps, frames.stamps, config)
+    session = DriftSession(frames, world.given[kept], steps, config, np.random.default_rng(0), View.of(frames.points))
+    wholes = assemble(session)
+    assert 1 <= len(wholes) <= config.n_wholes
+    assert wholes[0].cost == min(whole.cost for whole in wholes)
+    best = wholes[0]
+    assert len(best.T) == frames.n_frames
+    truth = world.label[rows]
+    right = sum(int(np.bincount(best.label[(truth == j) & (best.label >= 0)]).max()) for j in range(len(_PLACES)))
+    assert len(best.places) == len(_PLACES)
+    assert right >= 0.97 * len(truth)

@@ -11,7 +11,9 @@ from cluster_slam.association.drift_smoother import DriftSmoother, Steps
 from cluster_slam.association.frames import Frames
 from cluster_slam.config import ParticleConfig
 from cluster_slam.geometry import Array
-from cluster_slam.records import IntArray
+from cluster_slam.records import BoolArray, IntArray
+
+_BESIDE = 0.1  # of the picture's width: so far outside of what was seen a landmark still counts as in view
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,11 +26,42 @@ class State:
     cost: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What the camera sees: angles off its axis (2,), lowest and highest, and the largest range."""
+
+    low: Array
+    high: Array
+    range_m: float
+
+    @staticmethod
+    def of(points: Array) -> View:
+        """The view that points (m, 3) in the camera's frame show."""
+        if len(points) == 0:
+            return View(np.zeros(2), np.zeros(2), 0.0)
+        angles = _angles(points)
+        low, high = np.quantile(angles, [0.005, 0.995], axis=0)
+        beside = _BESIDE * float((high - low).max())
+        return View(low - beside, high + beside, float(np.linalg.norm(points, axis=1).max()))
+
+    def holds(self, points: Array) -> BoolArray:
+        """Which points (..., 3) in the camera's frame are in view."""
+        angles = _angles(points)
+        inside = ((angles > self.low) & (angles < self.high)).all(axis=-1)
+        near: BoolArray = inside & (np.linalg.norm(points, axis=-1) < self.range_m)
+        return near
+
+
+def _angles(points: Array) -> Array:
+    return np.arctan2(points[..., :2], points[..., 2:])
+
+
 class Labelling:
     """Labels of the points of one session, given poses to begin with."""
 
-    def __init__(self, frames: Frames, steps: Steps, config: ParticleConfig) -> None:
+    def __init__(self, frames: Frames, steps: Steps, config: ParticleConfig, view: View | None = None) -> None:
         self.frames, self.steps, self.config = frames, steps, config
+        self.view = View.of(frames.points) if view is None else view
 
     def settle(self, T: Array, label: IntArray, places: Array, price: float, n_rounds: int = 3) -> State:
         """Smooth, associate again, until nothing changes."""
@@ -43,7 +76,7 @@ class Labelling:
                 break
         T, places = smoother.solve(T, places, label)
         clutter = self.config.clutter_cost * int((label < 0).sum())
-        cost = smoother.cost(T, places, label) + clutter + price * len(places) + choice_cost(label)
+        cost = smoother.cost(T, places, label) + clutter + price * len(places) + self.choice_cost(T, places, label)
         return State(T, label, places, cost)
 
     def _smoother(self, n: int) -> DriftSmoother:
@@ -66,6 +99,39 @@ class Labelling:
             _, column = linear_sum_assignment(np.concatenate([cost[here], np.full((q, q), limit)], axis=1))
             label[here] = np.where(column < len(places), column, -1)
         return np.asarray(label)
+
+    def choice_cost(self, T: Array, places: Array, label: IntArray) -> float:
+        """Twice the negative log-probability of the labels (m,), given poses and how often landmarks in view are seen.
+
+        Without it two landmarks always fit the points of one better than one does: each point takes the nearer. Only
+        landmarks in view are a choice: many that stand elsewhere make no label less likely.
+        """
+        return self._chosen(self._candidates(T, places, label), label, self.rates(T, places, label))
+
+    def rates(self, T: Array, places: Array, label: IntArray) -> Array:
+        """How often (l,) each landmark is seen where it is in view."""
+        count = np.bincount(label[label >= 0], minlength=len(places))
+        return np.asarray(count / np.maximum(self._candidates(T, places, label).sum(axis=0), 1))
+
+    def chosen(self, state: State, rate: Array) -> float:
+        """The cost of the choice where rates (l,) are known."""
+        return self._chosen(self._candidates(state.T, state.places, state.label), state.label, rate)
+
+    def _chosen(self, in_view: BoolArray, label: IntArray, rate: Array) -> float:
+        known = label >= 0
+        expected = (in_view * rate).sum(axis=1)[self.frames.frame[: len(label)][known]]
+        return float(-2.0 * np.log(np.maximum(rate[label[known]], 1e-9) / np.maximum(expected, 1e-9)).sum())
+
+    def _candidates(self, T: Array, places: Array, label: IntArray) -> BoolArray:
+        """Which places (n, l) are in view of each frame, or seen."""
+        in_view = self._in_view(T, places)
+        known = label >= 0
+        in_view[self.frames.frame[: len(label)][known], label[known]] = True
+        return in_view
+
+    def _in_view(self, T: Array, places: Array) -> BoolArray:
+        """Which places (n, l) are in view of each frame."""
+        return self.view.holds(np.einsum("nji,nlj->nli", T[:, :3, :3], places[None] - T[:, None, :3, 3]))
 
     def merge(self, state: State, price: float, n_tries: int = 12) -> State:
         """Try close landmarks that are hardly ever seen together as one; keep what makes the whole likelier."""
@@ -100,16 +166,6 @@ class Labelling:
         allowed &= (distance < self.config.merge_reach_m) & np.tri(n, k=-1, dtype=bool)
         pairs = sorted((float(distance[a, b]), int(a), int(b)) for a, b in np.argwhere(allowed))
         return [(a, b) if count[a] <= count[b] else (b, a) for _, a, b in pairs]
-
-
-def choice_cost(label: IntArray) -> float:
-    """Twice the negative log-probability of the labels (m,), given how often each landmark is seen.
-
-    Without it two landmarks always fit the points of one better than one does: each point takes the nearer.
-    """
-    count = np.bincount(label[label >= 0])
-    count = count[count > 0]
-    return float(-2.0 * (count * np.log(count / max(count.sum(), 1))).sum())
 
 
 def _compact(places: Array, label: IntArray) -> tuple[Array, IntArray]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cluster_slam.association.drift_labels import Labelling, State
+from cluster_slam.association.drift_labels import Labelling, State, View
 from cluster_slam.association.drift_smoother import Steps
 from cluster_slam.association.frames import Frames
 from cluster_slam.association.submaps import window
@@ -26,16 +26,19 @@ class DriftSession:
     steps: Steps
     config: ParticleConfig
     rng: np.random.Generator
+    view: View
 
     @property
     def labels(self) -> Labelling:
         """What labels its points from poses that are nearly right."""
-        return Labelling(self.frames, self.steps, self.config)
+        return Labelling(self.frames, self.steps, self.config, self.view)
 
     def between(self, first: int, end: int) -> DriftSession:
         """The frames ``first`` to ``end`` (without it) as a session."""
         steps = self.steps.between(first, end)
-        return DriftSession(window(self.frames, first, end), self.given[first:end], steps, self.config, self.rng)
+        return DriftSession(
+            window(self.frames, first, end), self.given[first:end], steps, self.config, self.rng, self.view
+        )
 
     def place_covs(self, state: State) -> Array:
         """How well places are known (l, 3, 3) relative to the latest pose: noise that repeats, and that does not."""

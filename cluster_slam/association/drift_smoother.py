@@ -11,14 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solveh_banded
+from scipy.linalg import solve_triangular, solveh_banded
 
 from cluster_slam.association.frames import Frames, information
 from cluster_slam.config import ParticleConfig
 from cluster_slam.geometry import Array, adjoint, inverse, se3_exp, se3_log, skew
 from cluster_slam.records import IntArray
 
-_TIGHT = 1e12  # information of the first pose, which defines the world
+_TIGHT = 1e12  # information of the pose that defines the world
 _WEAK = 1e-6  # information of a place that nothing holds
 
 
@@ -56,6 +56,7 @@ class DriftSmoother:
     """Poses and places from odometry and points, the association given.
 
     ``known`` (l, 3) with ``known_information`` (l,) in 1/m^2 are the first l places as other observations have them.
+    The pose of the frame ``fixed`` stays: usually the first, which defines the world.
     """
 
     def __init__(
@@ -65,8 +66,9 @@ class DriftSmoother:
         point_dof: float,
         known: Array | None = None,
         known_information: Array | None = None,
+        fixed: int = 0,
     ) -> None:
-        self.frames, self.steps, self.point_dof = frames, steps, point_dof
+        self.frames, self.steps, self.point_dof, self.fixed = frames, steps, point_dof, fixed
         self.known = np.empty((0, 3)) if known is None else known
         self.known_information = np.empty(0) if known_information is None else known_information
         self.information = information(frames.covs)
@@ -134,15 +136,30 @@ class DriftSmoother:
         A = -(B.T @ adjoint(inverse(inverse(T[:-1]) @ T[1:])) @ B)
         AV = np.swapaxes(A, 1, 2) @ V
         H, g = np.zeros((n, d, d)), np.zeros((n, d))
-        H[0] += _TIGHT * np.eye(d)
+        H[self.fixed] += _TIGHT * np.eye(d)
         H[1:] += V
         H[:-1] += AV @ A
         g[1:] -= (V @ error[..., None])[..., 0]
         g[:-1] -= (AV @ error[..., None])[..., 0]
         return H, np.swapaxes(AV, 1, 2), g
 
+    def place_covs(self, T: Array, places: Array, label: IntArray) -> Array:
+        """Joint covariance (3 l, 3 l) of the places, seen from the pose that stays."""
+        _, _, schur, _ = self._eliminated(T, places, label)
+        half = np.linalg.cholesky(schur)
+        root = solve_triangular(half, np.eye(len(half)), lower=True, check_finite=False)
+        return np.asarray(root.T @ root)
+
     def _increments(self, T: Array, places: Array, label: IntArray) -> tuple[Array, Array]:
         """Steps (n, d) of the poses and (l, 3) of the places."""
+        n, d = len(T), self.steps.basis.shape[1]
+        Y, coupling, schur, g_place = self._eliminated(T, places, label)
+        dx = np.linalg.solve(schur, g_place.ravel() - coupling.T @ Y[:, 0])
+        dz: Array = (Y[:, 0] - Y[:, 1:] @ dx).reshape(n, d)
+        return dz, np.asarray(dx.reshape(len(places), 3))
+
+    def _eliminated(self, T: Array, places: Array, label: IntArray) -> tuple[Array, Array, Array, Array]:
+        """The poses solved for resting places and for each (n d, 1 + 3 l), their coupling, and those of places."""
         n, d, n_places = len(T), self.steps.basis.shape[1], len(places)
         rows, f, expected, error = self._point_errors(T, places, label)
         C = self.information[rows]
@@ -169,9 +186,7 @@ class DriftSmoother:
         schur = -coupling.T @ Y[:, 1:]
         for j in range(n_places):
             schur[3 * j : 3 * j + 3, 3 * j : 3 * j + 3] += M[j]
-        dx = np.linalg.solve(schur, g_place.ravel() - coupling.T @ Y[:, 0])
-        dz: Array = (Y[:, 0] - Y[:, 1:] @ dx).reshape(n, d)
-        return dz, np.asarray(dx.reshape(n_places, 3))
+        return Y, coupling, 0.5 * (schur + schur.T), g_place
 
 
 def _banded(H: Array, lower: Array) -> Array:

@@ -8,17 +8,18 @@ associated once more, with the map that the others make (``drift_redo``).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cluster_slam.association.calibration import Calibration, calibrate, delayed
 from cluster_slam.association.drift_joining import assemble
-from cluster_slam.association.drift_labels import State
+from cluster_slam.association.drift_labels import State, View
 from cluster_slam.association.drift_redo import redo
 from cluster_slam.association.drift_session import DriftSession
-from cluster_slam.association.drift_smoother import DriftSmoother, steps_of
+from cluster_slam.association.drift_smoother import DriftSmoother, Steps, steps_of
 from cluster_slam.association.frames import Frames
+from cluster_slam.association.seen_frames import filled, only_seen, seen_frames, step_of_each, summed_steps
 from cluster_slam.config import ParticleConfig
 from cluster_slam.geometry import Array, inverse, transform
 from cluster_slam.records import IntArray
@@ -47,13 +48,14 @@ def needs_tracing(frames: Frames, given: Array, cov_step: Array) -> bool:
     Where frames hold more points than their pose has unknowns, pieces correct the drift by themselves; and drift that
     stays below the noise of the points does no harm.
     """
-    if frames.n_frames < 3 or len(frames) < frames.n_frames:
+    n_seen = len(seen_frames(frames))
+    if n_seen < 3:
         return False
     range_sq = float(np.median((frames.points**2).sum(axis=1)))
     total = cov_step.sum(axis=0)
     drift_sq = np.trace(total[3:, 3:]) + np.trace(total[:3, :3]) * range_sq
     noise_sq = float(np.median(np.trace(frames.covs, axis1=1, axis2=2)))
-    return bool(drift_sq > 9.0 * noise_sq and len(frames) < 6 * frames.n_frames)
+    return bool(drift_sq > 9.0 * noise_sq and len(frames) < 6 * n_seen)
 
 
 def trace_drifting(
@@ -69,18 +71,35 @@ def trace_drifting(
     config : options.
     rng : for the particles.
     """
-    calibration = calibrate(frames, given, config)
+    kept = seen_frames(frames)
+    shown, cov_shown = only_seen(frames, kept), summed_steps(given, cov_step, kept)
+    calibration = calibrate(shown, given[kept], config)
     late = delayed(given, frames.stamps, calibration.lag_s)
-    steps = steps_of(late, cov_step, frames.stamps, config)
-    # Sharp points close by lead a search astray: the way is found with the usual noise at all ranges.
-    rough = DriftSession(calibration.without_growth().correct(frames), late, steps, config, rng)
-    start = _priced(rough, assemble(rough))
-    seen = calibration.correct(frames)
-    fine = DriftSession(seen, late, steps, config, rng)
-    best = _anchored(redo(fine, _priced(fine, start)), given[0])
-    weights = DriftSmoother(seen, steps, config.point_dof).step_weights(best.T)
-    scaled = cov_step * (config.odometry_scale**2 / weights)[:, None, None]
+    steps = steps_of(late[kept], cov_shown, shown.stamps, config)
+    best = _searched(shown, late[kept], steps, calibration, config, rng)
+    weights = DriftSmoother(calibration.correct(shown), steps, config.point_dof).step_weights(best.T)
+    best = _anchored(replace(best, T=filled(best.T, kept, late)), given[0])
+    scaled = cov_step * (config.odometry_scale**2 / step_of_each(weights, kept, len(cov_step)))[:, None, None]
     return Traced(best.T, best.label, best.places, scaled, best.cost, calibration)
+
+
+def _searched(
+    frames: Frames,
+    late: Array,
+    steps: Steps,
+    calibration: Calibration,
+    config: ParticleConfig,
+    rng: np.random.Generator,
+) -> State:
+    """The likeliest state found, all frames having points."""
+    # Sharp points close by lead a search astray: the way is found with the usual noise at all ranges.
+    seen = calibration.correct(frames)
+    view = View.of(seen.points)
+    rough = DriftSession(calibration.without_growth().correct(frames), late, steps, config, rng, view)
+    wholes = [_priced(rough, state) for state in assemble(rough)]
+    fine = DriftSession(seen, late, steps, config, rng, view)
+    start = min((_priced(fine, state) for state in wholes), key=lambda state: state.cost)
+    return redo(fine, start)
 
 
 def _priced(session: DriftSession, state: State) -> State:

@@ -15,13 +15,18 @@ from itertools import pairwise
 
 import numpy as np
 
+from cluster_slam.association.compatibility import Matches, Side
 from cluster_slam.association.drift_smoother import Steps
 from cluster_slam.association.frames import Frames
 from cluster_slam.geometry import Array, adjoint, inverse, se3_exp, skew, transform
-from cluster_slam.records import IntArray
+from cluster_slam.records import BoolArray, IntArray
 
 _MATCH = 16.0  # chi-square up to which two landmarks may be one
 _N_ITERATIONS = 6
+_APART = 0.1  # sigmas of odometry by which motions differ
+_MOST_DISTANCES = 2_000  # of a map that are compared with those of another
+_MOST_PAIRS = 20_000  # of hypotheses
+_BLOCK = 1_000_000  # distances that are held in memory at a time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +40,7 @@ class Part:
     places: Array  # (l, 3)
     var: Array  # (l,) m^2, how well each place is known
     frame: IntArray  # (q,) of each point, counted from the first
+    cost: float = 0.0  # twice the negative log-likelihood
 
     @property
     def weight(self) -> int:
@@ -78,40 +84,44 @@ def joined(a: Part, b: Part, z: Array, steps: Steps) -> Part:
     )
 
 
-def matched(part: Part, n_known: int) -> Part:
-    """The same with the landmarks from ``n_known`` on taken for the first ones where they lie on them, one to one."""
-    from scipy.optimize import linear_sum_assignment
-
-    known, new = part.places[:n_known], part.places[n_known:]
-    if len(known) == 0 or len(new) == 0:
-        return part
-    distance_sq = ((new[:, None] - known[None]) ** 2).sum(axis=-1)
-    chi2 = distance_sq / (part.var[n_known:, None] + part.var[None, :n_known])
-    alone = np.full((len(new), len(new)), _MATCH)
-    rows, columns = linear_sum_assignment(np.concatenate([np.minimum(chi2, 4.0 * _MATCH), alone], axis=1))
-    number = np.arange(len(part.places))
-    hit = columns < n_known
-    number[n_known + rows[hit]] = columns[hit]
-    return replace(part, label=np.where(part.label >= 0, number[part.label], -1))
+def identified(both: Part, a: Part, pairs: IntArray) -> Part:
+    """Two parts joined (``a`` the first of them) with landmarks (k, 2) of a and of the other taken for the same."""
+    number = np.arange(len(both.places))
+    number[len(a.places) + pairs[:, 1]] = pairs[:, 0]
+    return replace(both, label=np.where(both.label >= 0, number[both.label], -1))
 
 
-def motions(a: Part, b: Part, steps: Steps, n_best: int) -> Array:
-    """The likeliest motions (k, d) in the gap between two parts, beside what odometry says; none is the first."""
-    P, N = _predicted(a, b, steps), _border(a, b)
-    target, source = transform(inverse(P), a.places), transform(inverse(N), b.places)
-    prior = _gap_cov(a, b, steps)
-    d = steps.basis.shape[1]
-    i, j = _hypotheses(target, source, a.var, b.var)
-    z = np.concatenate([np.zeros((1, d)), _solve(target, source, a.var, b.var, i, j, prior, steps.basis)])
-    score = _score(z, target, source, a.var, b.var, prior, steps.basis)
-    chosen = [0]
+def sides(a: Part, b: Part, covs: tuple[Array, Array], steps: Steps) -> tuple[Side, Side]:
+    """Landmarks of both parts seen from the pose of b next to a: as odometry predicts it from a, and as b has it.
+
+    ``covs``: joint covariances (3 l, 3 l) of the places of each part, its pose next to the other standing still.
+    """
+    out = []
+    for part, cov, seen_from in ((a, covs[0], _predicted(a, b, steps)), (b, covs[1], _border(a, b))):
+        home = inverse(seen_from)
+        R = np.kron(np.eye(len(part.places)), home[:3, :3])
+        out.append(Side(transform(home, part.places), R @ (cov + np.diag(np.repeat(part.var, 3))) @ R.T))
+    return out[0], out[1]
+
+
+def motions(a: Side, b: Side, prior: Array, basis: Array, n_best: int) -> list[Matches]:
+    """The likeliest motions in the gap between two sides, with the landmarks they come from; odometry is the first."""
+    nothing = Matches(np.empty((0, 2), dtype=np.int64), np.zeros(basis.shape[1]), 0.0)
+    if len(a.places) == 0 or len(b.places) == 0:
+        return [nothing]
+    i, j = _hypotheses(a, b)
+    var_a, var_b = a.var, b.var
+    z = _solve(a.places, b.places, var_a, var_b, i, j, prior, basis)
+    score = _score(z, a.places, b.places, var_a, var_b, prior, basis)
+    chosen: list[int] = []
     scale = np.sqrt(np.diagonal(prior))
     for k in np.argsort(-score, kind="stable").tolist():
-        if len(chosen) > n_best:
+        if len(chosen) >= n_best:
             break
-        if all(np.abs((z[k] - z[c]) / scale).max() > 0.1 for c in chosen):
+        if (np.abs((z[k] - z[chosen]) / scale).max(axis=1) > _APART).all():
             chosen.append(k)
-    return np.asarray(z[chosen])
+    pairs = np.stack([i, j], axis=-1)
+    return [nothing, *(Matches(np.unique(pairs[k], axis=0), z[k], float(score[k])) for k in chosen)]
 
 
 def _border(a: Part, b: Part) -> Array:
@@ -126,12 +136,21 @@ def _predicted(a: Part, b: Part, steps: Steps) -> Array:
     return np.asarray(a.T[0] @ inverse(steps.motion[b.end - 1]))
 
 
+def gap_drift(a: Part, b: Part, steps: Steps, range_sq: float) -> float:
+    """By how much (m^2) odometry leaves open where the points of part b lie beside those of part a, before it."""
+    cov = np.diagonal(steps.basis @ _gap_cov(a, b, steps) @ steps.basis.T)
+    return float(cov[3:].sum() + cov[:3].sum() * range_sq)
+
+
 def _gap_cov(a: Part, b: Part, steps: Steps) -> Array:
     """Covariance (d, d) of the border pose of b by odometry from the last pose of a that a landmark holds."""
     B = steps.basis
-    held = a.first + np.flatnonzero(np.bincount(a.frame[a.label >= 0], minlength=len(a.T)) > 0)
     after = b.first >= a.end
-    start, end = (int(held[-1]), b.first) if after else (b.end - 1, int(held[0]))
+    held = a.frame[a.label >= 0]
+    if after:
+        start, end = a.first + int(held.max(initial=0)), b.first
+    else:
+        start, end = b.end - 1, a.first + int(held.min(initial=len(a.T) - 1))
     cov, total = np.zeros((6, 6)), np.eye(4)
     for k in range(start, end):
         A = adjoint(inverse(steps.motion[k]))
@@ -144,20 +163,38 @@ def _gap_cov(a: Part, b: Part, steps: Steps) -> Array:
     return out
 
 
-def _hypotheses(target: Array, source: Array, var_a: Array, var_b: Array) -> tuple[IntArray, IntArray]:
+def gap_cov(a: Part, b: Part, steps: Steps) -> Array:
+    """Covariance (d, d) of the pose of b next to a, by odometry from the pose of a next to b."""
+    B = steps.basis
+    if b.first >= a.end:
+        return np.asarray(steps.cov[a.end - 1])
+    A = adjoint(steps.motion[b.end - 1])
+    return np.asarray(B.T @ A @ B @ steps.cov[b.end - 1] @ B.T @ A.T @ B)
+
+
+def _hypotheses(a: Side, b: Side) -> tuple[IntArray, IntArray]:
     """Landmarks (h, 2) of a and of b that may be the same: pairs as far apart as each other, and single ones twice."""
-    n, m = len(target), len(source)
-    Da = np.linalg.norm(target[:, None] - target, axis=-1)
-    Db = np.linalg.norm(source[:, None] - source, axis=-1)
-    i1, i2 = np.nonzero(np.logical_not(np.eye(n, dtype=bool)))
-    j1, j2 = np.nonzero(np.tri(m, k=-1, dtype=bool))
-    var = (var_a[i1] + var_a[i2])[:, None] + (var_b[j1] + var_b[j2])[None]
-    fits = (Da[i1, i2][:, None] - Db[j1, j2][None]) ** 2 < _MATCH * var
+    n, m = len(a.places), len(b.places)
+    (Da, var_a), (Db, var_b) = a.distances(), b.distances()
+    i1, i2 = _surest(var_a, np.logical_not(np.eye(n, dtype=bool)))
+    j1, j2 = _surest(var_b, np.tri(m, k=-1, dtype=bool))
+    var = var_a[i1, i2][:, None] + var_b[j1, j2]
+    fits = (Da[i1, i2][:, None] - Db[j1, j2]) ** 2 < _MATCH * var
     h, g = np.nonzero(fits)
+    if len(h) > _MOST_PAIRS:
+        surest = np.argsort(var[h, g], kind="stable")[:_MOST_PAIRS]
+        h, g = h[surest], g[surest]
     one_i, one_j = np.divmod(np.arange(n * m), max(m, 1))
     i = np.concatenate([np.column_stack([i1[h], i2[h]]), np.column_stack([one_i, one_i])])
     j = np.concatenate([np.column_stack([j1[g], j2[g]]), np.column_stack([one_j, one_j])])
     return i, j
+
+
+def _surest(var: Array, allowed: BoolArray) -> tuple[IntArray, IntArray]:
+    """Pairs of landmarks whose distance is known best, in order of their numbers, not too many of them."""
+    i, j = np.nonzero(allowed)
+    kept = np.sort(np.argsort(var[i, j], kind="stable")[:_MOST_DISTANCES])
+    return i[kept], j[kept]
 
 
 def _solve(
@@ -186,8 +223,11 @@ def _score(z: Array, target: Array, source: Array, var_a: Array, var_b: Array, p
     """How much (h,) landmarks that come to lie on others explain, less how unusual the motion is."""
     if len(target) == 0 or len(source) == 0:
         return np.zeros(len(z))
-    moved = transform(se3_exp(z @ basis.T)[:, None], np.broadcast_to(source, (len(z), *source.shape)))
-    chi2 = ((target[None, :, None] - moved[:, None]) ** 2).sum(axis=-1) / (var_a[:, None] + var_b[None])
-    explained = np.maximum(0.0, _MATCH - chi2.min(axis=1)).sum(axis=1)
+    explained = np.empty(len(z))
+    for rows in np.array_split(np.arange(len(z)), len(z) * len(target) * len(source) // _BLOCK + 1):
+        moved = transform(se3_exp(z[rows] @ basis.T)[:, None], np.broadcast_to(source, (len(rows), *source.shape)))
+        distance_sq = ((target[None, :, None] - moved[:, None]) ** 2).sum(axis=-1)
+        chi2 = distance_sq / (var_a[:, None] + var_b[None])
+        explained[rows] = np.maximum(0.0, _MATCH - chi2.min(axis=1)).sum(axis=1)
     unusual = np.einsum("hi,hi->h", z, np.linalg.solve(prior, z.T).T)
     return np.asarray(explained - (2.0 + len(prior)) * np.log1p(unusual / 2.0))
