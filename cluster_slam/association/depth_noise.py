@@ -7,7 +7,7 @@ squared by 4 sigma^2 / z, which many views do not average away. The noise at the
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,29 @@ from cluster_slam.geometry import Array
 _FEWEST = 50  # observations that tell how noise depends on depth
 _LEAST_SPREAD = 0.02  # of the logarithm of their depths
 _STEEPEST = 4.0  # power of depth
+_LEAST_DEPTH = 1e-6  # m
 _FARTHEST = 2.0  # times the measured depth: what is expected farther off is no error of depth
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseShape:
+    """Sigmas at a depth of 1 m, of the depth and in the image's plane, m, and the powers of depth they grow with.
+
+    An error of the depth moves a point along its ray; one of the pixel moves it at the same depth.
+    """
+
+    depth: float
+    lateral: float
+    power_depth: float = 0.0
+    power_lateral: float = 0.0
+
+    def covs(self, points: Array, depth: Array) -> Array:
+        """Covariances (m, 3, 3) of points (m, 3) in the camera frame that are at ``depth`` (m,) m."""
+        ray = points / np.maximum(np.abs(points[:, 2:]), _LEAST_DEPTH)
+        lateral = (self.lateral * depth**self.power_lateral) ** 2
+        along = (self.depth * depth**self.power_depth) ** 2
+        out: Array = lateral[:, None, None] * np.diag([1.0, 1.0, 0.0]) + along[:, None, None] * _squares(ray)
+        return out
 
 
 def at_expected_depth(frames: Frames, depth: Array) -> Frames:
@@ -31,13 +53,22 @@ def at_expected_depth(frames: Frames, depth: Array) -> Frames:
     return replace(frames, covs=covs)
 
 
+def expected_depth(points: Array, depth: Array | None) -> Array:
+    """Depth (m,) m of points (m, 3) where it is known, as far as it can be one of theirs; as measured elsewhere."""
+    measured = np.maximum(np.abs(points[:, 2]), _LEAST_DEPTH)
+    if depth is None:
+        return measured
+    near = np.clip(depth, measured / _FARTHEST, measured * _FARTHEST)
+    return np.where(np.isfinite(depth), near, measured)
+
+
 def stretched(points: Array, covs: Array, depth: Array, powers: tuple[float, float]) -> Array:
     """Covariances (m, 3, 3) as they would be stated at ``depth`` (m,) m of points (m, 3) ahead, with these powers."""
     along, across = powers
     ratio = np.clip(depth / points[:, 2], 1.0 / _FARTHEST, _FARTHEST)
     u = points / np.linalg.norm(points, axis=1)[:, None]
     stretch = (ratio**across)[:, None, None] * np.eye(3)
-    stretch = stretch + (ratio**along - ratio**across)[:, None, None] * u[:, :, None] * u[:, None]
+    stretch = stretch + (ratio**along - ratio**across)[:, None, None] * _squares(u)
     out: Array = stretch @ covs @ stretch
     return out
 
@@ -55,3 +86,9 @@ def powers_of_depth(frames: Frames) -> tuple[float, float]:
     x = np.log(z[ahead]) - np.log(z[ahead]).mean()
     slopes = [float(x @ np.log(np.sqrt(var)) / (x @ x)) for var in (along, across)]
     return float(np.clip(slopes[0], 0.0, _STEEPEST)), float(np.clip(slopes[1], 0.0, _STEEPEST))
+
+
+def _squares(v: Array) -> Array:
+    """Outer products (m, 3, 3) of vectors (m, 3) with themselves."""
+    out: Array = v[:, :, None] * v[:, None]
+    return out

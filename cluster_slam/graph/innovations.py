@@ -49,13 +49,10 @@ def frame_posterior(smoother: BatchSmoother, A_z: Array, A_d: Array, used: BoolA
     return FramePosterior(cov_z, cov_d - between @ np.swapaxes(by_pose, 1, 2), np.asarray(between, np.float64))
 
 
-def squared_innovations(smoother: BatchSmoother, estimate: Estimate) -> Array:
-    """Squared normalised innovation (m,) of each sorted observation, three degrees of freedom; NaN where unassigned."""
-    out = np.full(smoother.m, np.nan)
-    A_z, A_d, r = smoother.whitened(estimate)
+def influence(smoother: BatchSmoother, estimate: Estimate) -> tuple[Array, BoolArray]:
+    """Blocks (q, 3, 3) of the influence matrix, whitened, and which of the assigned observations (q,) had weight."""
+    A_z, A_d, _ = smoother.whitened(estimate)
     used = estimate.weight[smoother.rows] > 0.5
-    if len(r) == 0:
-        return out
     root = np.sqrt(smoother.correlation)
     A_z, A_d = A_z / root, A_d / root
     posterior = frame_posterior(smoother, A_z, A_d, used, smoother.pose_information(estimate))
@@ -64,6 +61,16 @@ def squared_innovations(smoother: BatchSmoother, estimate: Estimate) -> Array:
     K += A_d @ posterior.displacement[smoother.pair] @ np.swapaxes(A_d, 1, 2)
     count = np.bincount(smoother.landmark[used], minlength=smoother.n_places)
     K += np.eye(3) / (smoother.correlation * np.maximum(count, 1))[smoother.landmark, None, None]
+    return K, used
+
+
+def squared_innovations(smoother: BatchSmoother, estimate: Estimate) -> Array:
+    """Squared normalised innovation (m,) of each sorted observation, three degrees of freedom; NaN where unassigned."""
+    out = np.full(smoother.m, np.nan)
+    r, _ = smoother.residuals(estimate)
+    if len(r) == 0:
+        return out
+    K, used = influence(smoother, estimate)
     # What had no weight has taken nothing up: its innovation is its residual, and errs as both do.
     size, axes = np.linalg.eigh(np.eye(3) - np.where(used, 1.0, -1.0)[:, None, None] * K)
     along = (np.swapaxes(axes, 1, 2) @ r[..., None])[..., 0]

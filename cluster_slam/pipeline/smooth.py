@@ -56,6 +56,8 @@ def smooth(
     stated_poses = pose_model(session)
     say("calibrating", 0.0)
     world = first_world(stated, stated_poses, config, rng)
+    if not session.observations.has_covariance:
+        world = replace(world, only_sigma=session.noise.flower)
     stated, stated_poses = corrected(stated, stated_poses, world.instruments)
     noise_stated = world.noise
     clock.lap("landmarks")

@@ -8,10 +8,11 @@ lets 95 % of them pass.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
+from cluster_slam.association.depth_noise import NoiseShape, expected_depth
 from cluster_slam.geometry import Array, rotate_cov
 from cluster_slam.records import IntArray, Result
 
@@ -102,12 +103,21 @@ def _views(result: Result) -> Iterator[_Views]:
 def _view_of(result: Result, rows: IntArray) -> _Views:
     observations, flowers = result.session.observations, result.flowers
     T = result.T_world_camera[observations.frame[rows]]
-    factor = result.diagnostics.estimated_noise.get("flower_factor", 1.0) ** 2
     where = np.searchsorted(flowers.ids, result.flower_ids[rows])
-    covs = rotate_cov(T[..., :3, :3], factor * observations.covs[rows])
+    covs = rotate_cov(T[..., :3, :3], _covs_found(result, rows.ravel()).reshape(*rows.shape, 3, 3))
     return _Views(
         seen=(T[..., :3, :3] @ observations.points[rows][..., None])[..., 0] + T[..., :3, 3],
         seen_covs=covs,
         mapped=flowers.positions[where],
         mapped_covs=covs / flowers.n_observations[where][..., None, None],
     )
+
+
+def _covs_found(result: Result, rows: IntArray) -> Array:
+    """Covariances (m, 3, 3) of observations in the camera frame, as the session's residuals have them."""
+    noise, observations = result.diagnostics.estimated_noise, result.session.observations
+    if "flower_depth" not in noise:
+        return noise.get("flower_factor", 1.0) ** 2 * observations.covs[rows]
+    shape = NoiseShape(**{field.name: noise[f"flower_{field.name}"] for field in fields(NoiseShape)})
+    points = observations.points[rows]
+    return shape.covs(points, expected_depth(points, None))

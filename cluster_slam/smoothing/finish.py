@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 from scipy.linalg import eigh
@@ -139,6 +139,11 @@ def estimated_noise(session: Session, frames: Frames, world: World, smoother: Ba
         found["pose_rotation"] = stated.pose_rotation * float(np.sqrt(noise.pose))
     found["wild_share"] = world.wild_share
     found["flower_factor"] = float(np.sqrt(noise.flower))
+    if world.shape is not None:
+        found["flower_factor"] = found["flower"] / stated.flower
+        shape, factor = world.shape, float(np.sqrt(noise.flower))
+        shape = replace(shape, depth=factor * shape.depth, lateral=factor * shape.lateral)
+        found |= {f"flower_{name}": value for name, value in asdict(shape).items()}
     found["pose_factor"] = float(np.sqrt(noise.pose))
     if len(smoother.pairs.sigma):
         found["sway"] = float(np.sqrt((smoother.pairs.total_sigma**2).mean()))

@@ -7,11 +7,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cluster_slam.association.calibration import Calibration, delayed
-from cluster_slam.association.depth_noise import at_expected_depth
+from cluster_slam.association.depth_noise import NoiseShape, at_expected_depth, expected_depth
 from cluster_slam.association.frames import Frames
 from cluster_slam.config import SmoothConfig
 from cluster_slam.geometry import Array
 from cluster_slam.graph.batch import BatchSmoother, Estimate, Marginals
+from cluster_slam.graph.noise_shape import noise_shape
 from cluster_slam.graph.poses import PoseModel
 from cluster_slam.graph.variance import VarianceFactors, variance_factors
 from cluster_slam.records import IntArray, StatedNoise
@@ -36,6 +37,8 @@ class World:
     cov_step: Array | None = None  # (n - 1, 6, 6) of odometry, where following its drift has told more than is stated
     wild_share: float = 0.0  # of observations whose errors are several times what the others' are
     errs_slowly: bool = False  # errors of observations cannot be told from drift of the poses
+    only_sigma: float | None = None  # m, where that is all that is stated of the observations' noise
+    shape: NoiseShape | None = None  # then what was found of it
     depth: Array | None = None  # (m,) m, where the flowers of observations are; NaN where that is not known
     instruments: Calibration = field(default_factory=Calibration)  # what the session shows to be wrong with them
 
@@ -55,8 +58,10 @@ def for_solving(frames: Frames, model: PoseModel, world: World) -> tuple[Frames,
 
     The estimated poses' own errors look like motion there, and would pull it away (errors in variables).
     """
+    if world.shape is not None:
+        frames = replace(frames, covs=world.shape.covs(frames.points, expected_depth(frames.points, world.depth)))
     frames, model = with_variances(frames, model, world.noise)
-    if world.depth is not None:
+    if world.depth is not None and world.shape is None:
         frames = at_expected_depth(frames, world.depth)
     free = np.eye(6) - world.held
     cov = free @ model.cov_hand_eye @ free + 1e-12 * world.held
@@ -69,11 +74,17 @@ def learn(world: World, smoother: BatchSmoother, estimate: Estimate) -> World:
     found = variance_factors(smoother, estimate)
     if world.errs_slowly:
         found = VarianceFactors(1.0, 1.0, NO_WEIGHT)  # slow errors hide from residuals: the stated ones stay
-    noise = _combined(world, found, in_stretches=len(smoother.pairs.stretch_sigma) > 0)
+    in_stretches = len(smoother.pairs.stretch_sigma) > 0
+    noise = _combined(world, found, in_stretches=in_stretches)
+    shape = world.shape
+    if world.only_sigma is not None and not in_stretches and not world.errs_slowly:
+        shape = noise_shape(smoother, estimate, _LEAST_FACTOR * world.only_sigma**2) or shape
+    if shape is not world.shape:  # holds all that residuals say of the size, too
+        noise = replace(noise, flower=1.0)
     noise = replace(noise, flower=max(noise.flower, _LEAST_FACTOR), pose=max(noise.pose, _LEAST_FACTOR))
     depth = np.full(smoother.m, np.nan)
     depth[smoother.rows] = smoother.residuals(estimate)[1][:, 2]
-    return replace(world, T=estimate.T, X=estimate.X, places=estimate.places, noise=noise, depth=depth)
+    return replace(world, T=estimate.T, X=estimate.X, places=estimate.places, noise=noise, depth=depth, shape=shape)
 
 
 def _combined(world: World, found: VarianceFactors, *, in_stretches: bool) -> VarianceFactors:
