@@ -8,17 +8,18 @@ from pathlib import Path
 
 import numpy as np
 from map_help import map_of, rest_incoming
+from test_constellation import plant_of
 
 from cluster_slam.config import MapConfig
 from cluster_slam.constellation.fit import Pairs, pose_covariance
-from cluster_slam.constellation.growth import DAY_S
+from cluster_slam.constellation.growth import DAY_S, at, memory_days
 from cluster_slam.constellation.identify import Identities
 from cluster_slam.io.map import open_map
 from cluster_slam.pipeline.remember import add
 from cluster_slam.remember.gauge import frame_covariance
 from cluster_slam.remember.hold import Seen, holding
 from cluster_slam.remember.predict import membership_cov
-from cluster_slam.remember.seen import Habits, learned_seen_share
+from cluster_slam.remember.seen import PRIOR_SURPRISES, Habits, habits_of, learned_seen_share, scattered
 from cluster_slam.remember.tables import aligned
 from cluster_slam.remember.update import update
 from cluster_slam.simulate.config import SimulateConfig
@@ -67,8 +68,8 @@ def test_ellipsoids_hold_what_a_gaussian_would_not() -> None:
     smooth = np.tile(1e-6 * np.eye(3), (n, 1, 1))
     unknown, spread = np.array([-np.log(0.9), -np.log(0.98), 0.0, 0.0]), np.full(n, 0.02**2)
     offsets = np.array([[0.0, 0.0, 0.0]] * 3 + [[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0]])
-    seen = Seen(offsets, np.array([1.0, 1.0, 1.0, 0.5, 0.5]), np.array([0, 1, 2, 3, 3]), unknown, spread)
-    sure = Habits(0.9999, 1e9, 1.0, 1e9)
+    seen = Seen(offsets, np.array([1.0, 1.0, 1.0, 0.5, 0.5]), np.array([0, 1, 2, 3, 3]), unknown, spread, np.zeros(n))
+    sure = Habits(0.9999, 1e9, 1.0, 1.0, 1e9)
     covs = smooth + membership_cov(offsets, seen.share, seen.row, unknown, spread)
     held = holding(covs, smooth, seen, sure)
     radius = np.sqrt(7.815 * np.array([np.diag(c).min() for c in held]))
@@ -92,6 +93,56 @@ def test_the_share_of_flowers_that_are_seen_is_learned(tmp_path: Path) -> None:
     with open_map(tmp_path / "row3.map") as store:
         assert add(store, replace(rest_incoming(plant), constellation=second)).session is not None
         assert 0.45 < learned_seen_share(store.plant("row3"), MapConfig())[0] < 0.75
+
+
+def test_flowers_that_come_with_time_are_told_from_those_that_come_at_once(tmp_path: Path) -> None:
+    """Nobody hidden, none false, but three times as many new ones as expected: after a long gap more are expected."""
+    config = replace(SEASON, new_per_day=0.09, lost_per_day=0.0, session=SimulateConfig(n_clusters=30))
+    plant, options = SeasonPlant(config, seed=3), MapConfig()
+    with map_of(tmp_path, plant) as store:
+        before = habits_of(store.plant("row3"), options)
+        for day in (4.0, 8.0):
+            plant.grow_to(day)
+            assert add(store, rest_incoming(plant)).session is not None
+        after = habits_of(store.plant("row3"), options)
+    assert (before.at_once, before.since) == (1.0, 1.0)
+    assert 1.8 < after.since < 3.3
+    assert after.share > 0.97
+
+
+def test_where_flowers_come_is_learned() -> None:
+    """One of three flowers came later, three sigma along each axis from the middle of the other two: 9 / 1.5."""
+    config = replace(SEASON, session=SimulateConfig(n_clusters=12))
+    plant = plant_of(SeasonPlant(config, seed=3).rest().constellation)
+    time, flowers = plant.flower_first_seen.copy(), plant.flowers.copy()
+    assert scattered(plant, np.ones(len(plant.cluster_ids))) == 1.0  # nobody came later
+    mine = np.flatnonzero(plant.flower_rows == 1)[:3]
+    others = np.flatnonzero(plant.flower_rows == 1)[3:]
+    time[others] = time[mine[2]] = time[0] + DAY_S
+    flowers[mine[2]] = flowers[others] = flowers[mine[:2]].mean(axis=0) + 3.0
+    found = scattered(replace(plant, flower_first_seen=time, flowers=flowers), np.ones(len(plant.cluster_ids)))
+    n = 1 + len(others)
+    np.testing.assert_allclose(found, (PRIOR_SURPRISES + n * 9.0 / 1.5) / (PRIOR_SURPRISES + n))
+
+
+def test_a_plant_that_drifts_steadily_is_predicted_better(tmp_path: Path) -> None:
+    """After three gaps without a walk the plant is known to be steady, and one that walks to be none."""
+    rates, sigmas = [], []
+    for walk in (0.0, 0.002):
+        config = replace(SEASON, walk_m_per_sqrt_day=walk, session=SimulateConfig(n_clusters=30))
+        plant, options = SeasonPlant(config, seed=5), MapConfig()
+        folder = tmp_path / str(walk)
+        folder.mkdir()
+        with map_of(folder, plant) as store:
+            for day in (1.0, 3.0, 7.0):
+                plant.grow_to(day)
+                assert add(store, rest_incoming(plant)).session is not None
+            known = store.plant("row3")
+        week = at(known, known.last_session + 7 * DAY_S, options.growth)
+        rates.append(memory_days(known, options.growth))
+        sigmas.append(float(np.sqrt(np.trace(week.cluster_covs, axis1=1, axis2=2).mean() / 3.0)))
+    assert rates[0] > 120.0 > 60.0 > rates[1]
+    assert sigmas[0] < 0.0035 < 0.006 < sigmas[1]
 
 
 def test_the_frame_is_as_sure_as_the_mean_drift(tmp_path: Path) -> None:

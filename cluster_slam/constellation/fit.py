@@ -66,11 +66,25 @@ def variance_factors(pairs: Pairs, pose: Similarities) -> tuple[float, float]:
     own = within / np.bincount(pairs.unit, c.within, pairs.n_units)
     left = max(d * pairs.n_units - d * (d + 1) / 2, 1.0) / pairs.n_units
     squared = ((moved - c.mean_b) ** 2).sum(axis=1) * d / left
+    weight, factors = factor_posterior(squared / d, left, pairs.var_offset, own)
+    return within, float(weight @ factors)
+
+
+def factor_posterior(mean_square: Array, dof: float, variance: Array, noise: Array) -> tuple[Array, Array]:
+    """Weights and factors (g,): by how much variances may be wrong, where what they have in common is one factor.
+
+    Parameters
+    ----------
+    mean_square
+        (u,) of residuals, along an axis, of variance factor * ``variance`` + ``noise``.
+    dof
+        Degrees of freedom of each. A factor of two is one sigma beforehand.
+    """
     factors = np.exp2(np.linspace(-4.0, 4.0, 65))
-    total = factors[:, None] * pairs.var_offset + own
-    log_density = -0.5 * left * (np.log(total) + squared / d / total).sum(axis=1) - 0.5 * np.log2(factors) ** 2
+    total = factors[:, None] * variance + noise
+    log_density = -0.5 * dof * (np.log(total) + mean_square / total).sum(axis=1) - 0.5 * np.log2(factors) ** 2
     weight = np.exp(log_density - log_density.max())
-    return within, float(weight @ factors / weight.sum())
+    return weight / weight.sum(), factors
 
 
 def fit(pairs: Pairs, scale_range: tuple[float, float]) -> Similarities:

@@ -11,6 +11,7 @@ from cluster_slam.geometry import Array
 from cluster_slam.records import PlantMap
 
 DAY_S = 86400.0
+UNSTEADY = (0.01, 10.0)  # variance of a plant's walk, and how soon its drift turns, over what was expected: limits
 
 
 def at(plant: PlantMap, time: float, config: GrowthConfig | None = None) -> PlantMap:
@@ -36,7 +37,7 @@ def at(plant: PlantMap, time: float, config: GrowthConfig | None = None) -> Plan
     dt = gaps(plant, time)
     days = np.abs(dt) / DAY_S
     passed = dt != 0.0
-    memory = config.memory_days * DAY_S
+    memory = memory_days(plant, config) * DAY_S
     kept = np.exp(-np.abs(dt) / memory)  # of the velocity
     path = np.sign(dt) * memory * (1.0 - kept)  # s: how far today's velocity leads
     prior = (plant.drift_rate / DAY_S) ** 2 / 3.0
@@ -65,6 +66,24 @@ def at(plant: PlantMap, time: float, config: GrowthConfig | None = None) -> Plan
         flowers=clusters[row] + size[:, None] * offsets,
         flower_covs=plant.flower_covs + flower_walk[:, None, None] * np.eye(3) + radial,
     )
+
+
+def memory_days(plant: PlantMap, config: GrowthConfig) -> float:
+    """After how long a plant's clusters drift in another direction: shorter on a plant that walks more than expected.
+
+    A walk and a drift that turns are two names for what steady drift does not explain; a few gaps of days do not tell
+    them apart. What is learned of one is taken for both.
+    """
+    walk = max(plant.walk_rate, 1e-12) / max(config.walk_m_per_sqrt_day, 1e-12)
+    return config.memory_days / float(np.clip(walk**2, *UNSTEADY))
+
+
+def unsteady(plant: PlantMap, dt: Array, config: GrowthConfig) -> Array:
+    """Variance (c,) along each axis that a time (s) adds to a place, beside steady drift, on a plant as expected, m^2."""
+    dt = np.abs(dt)
+    prior = (plant.drift_rate / DAY_S) ** 2 / 3.0
+    walked: Array = config.walk_m_per_sqrt_day**2 * dt / DAY_S
+    return walked + prior * _wander(dt, config.memory_days * DAY_S)
 
 
 def _wander(dt: Array, memory: float) -> Array:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cluster_slam.config import MapConfig
+from cluster_slam.constellation.growth import memory_days
 from cluster_slam.constellation.identify import Identities, identify, nobody
 from cluster_slam.constellation.match import Found
 from cluster_slam.errors import InputError
@@ -146,7 +147,7 @@ def _known(store: MapStore, incoming: Incoming, found: Found, decision: Decision
     evidence, T = decision.matches[0].evidence, found.T_map_world
     now, sessions = incoming.constellation.start, store.sessions(plant.name)
     low, high = found.scene.scale_range
-    memory = config.growth.memory_days
+    memory = memory_days(plant, config.growth)
     factor, with_scale = found.offset_factor, low < high
     cov = frame_covariance(
         found.pairs, found.scale, plant, sessions, now, memory, drift_factor=factor, with_scale=with_scale

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from cluster_slam.config import MapConfig
-from cluster_slam.constellation.growth import DAY_S, gaps
+from cluster_slam.constellation.fit import factor_posterior
+from cluster_slam.constellation.growth import DAY_S, UNSTEADY, at, gaps, unsteady
 from cluster_slam.constellation.identify import Identities
 from cluster_slam.geometry import Array
 from cluster_slam.records import BoolArray, IntArray, PlantMap
@@ -64,10 +65,10 @@ class Follower:
         for c in np.setdiff1d(np.flatnonzero(self.seen), again).tolist():
             self._carry(c)
         self.seen[again] = True
-        shifts = [self._shift(c) for c in again.tolist()]
-        self.walk_rate = self._learn_walk(again, shifts)
-        for shift in shifts:
-            self._follow(shift)
+        self.walk_rate = self._learn_walk(again, [self._shift(c) for c in again.tolist()])
+        self.moved = at(replace(self.plant, walk_rate=self.walk_rate), self.now, self.config.growth)
+        for c in again.tolist():
+            self._follow(self._shift(c))
 
     def _carry(self, c: int) -> None:
         """A cluster that was seen again with other flowers only stands where it was expected."""
@@ -90,22 +91,24 @@ class Follower:
 
     def _learn_walk(self, rows: IntArray, shifts: list[_Shift]) -> float:
         """Random walk of the clusters, m/sqrt(day): what steady drift does not explain (expectation maximisation)."""
-        days = np.abs(self.dt[rows]) / DAY_S
-        used = np.flatnonzero(days > 0.25)
-        prior = self.plant.walk_rate
-        if len(used) < 4:
-            return prior
+        growth, before = self.config.growth, self.plant.walk_rate
+        used = np.flatnonzero(np.abs(self.dt[rows]) > 0.25 * DAY_S)
+        if len(used) < 4 or growth.walk_m_per_sqrt_day == 0.0:
+            return before
         means = np.array([shifts[k].mean for k in used.tolist()])
-        squared = ((means - np.median(means, axis=0)) ** 2).sum(1) / 3.0
+        lost = len(used) / (len(used) - 2.0)  # 6 of 3 n components went into the alignment
+        squared = lost * ((means - np.median(means, axis=0)) ** 2).sum(1) / 3.0
         noise = np.array([np.trace(shifts[k].cov) / 3.0 for k in used.tolist()])
         total = np.trace(self.moved.cluster_covs[rows[used]], axis1=1, axis2=2) / 3.0 + noise
-        rest, days, rate_sq = total - prior**2 * days[used], days[used], prior**2
+        expected = unsteady(self.plant, self.dt[rows[used]], growth)
+        prior = float(np.clip((before / growth.walk_m_per_sqrt_day) ** 2, *UNSTEADY))
+        rest, factor = np.maximum(total - prior * expected, noise), prior
         for _ in range(N_ROUNDS):
-            own = rate_sq * days
+            own = factor * expected
             share = own / (rest + own)
-            walked = (share**2 * np.minimum(squared, 9.0 * total) + own * (1.0 - share)) / days
-            rate_sq = (PRIOR_CLUSTERS * prior**2 + float(walked.sum())) / (PRIOR_CLUSTERS + len(used))
-        return float(np.sqrt(rate_sq))
+            walked = (share**2 * np.minimum(squared, 9.0 * total) + own * (1.0 - share)) / expected
+            factor = (PRIOR_CLUSTERS * prior + float(walked.sum())) / (PRIOR_CLUSTERS + len(used))
+        return float(np.sqrt(np.clip(factor, *UNSTEADY))) * growth.walk_m_per_sqrt_day
 
     def _follow(self, shift: _Shift) -> None:
         v, c = self.values, shift.cluster
@@ -117,11 +120,11 @@ class Follower:
     def _move(self, c: int, mean: Array, R: Array) -> Array:
         """Kalman update of a cluster's place and drift with how far it was from where it was expected: the shift."""
         v, moved = self.values, self.moved
-        walked = (self.walk_rate**2 - self.plant.walk_rate**2) * abs(self.dt[c]) / DAY_S
-        P = moved.cluster_covs[c] + walked * np.eye(3)
-        nis = float(mean @ np.linalg.solve(P + R, mean)) / 3.0
-        inflate = max(1.0, nis)  # it moved farther than was thought possible: its drift is less known than was thought
-        P, C, V = (inflate * m for m in (P, moved.position_velocity_covs[c], moved.velocity_covs[c]))
+        P = moved.cluster_covs[c]
+        size, noise = (np.array([np.trace(m) / 3.0]) for m in (P, R))
+        weight, factors = factor_posterior(np.array([mean @ mean / 3.0]), 3.0, size, noise)
+        factor = float(np.exp(weight @ np.log(factors)))  # what this cluster says of how unsure its drift was
+        P, C, V = (factor * m for m in (P, moved.position_velocity_covs[c], moved.velocity_covs[c]))
         S = P + R
         K, Kv = np.linalg.solve(S, P).T, np.linalg.solve(S, C).T
         v["cluster_covs"][c] = _symmetric(P - K @ P)

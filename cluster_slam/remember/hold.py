@@ -23,7 +23,8 @@ class Seen:
     share: Array  # (f,) probability of being seen
     row: IntArray  # (f,) cluster
     unknown: Array  # (c,) mean number of others
-    spread: Array  # (c,) their variance along each axis
+    spread: Array  # (c,) their variance along each axis about the cluster's middle ...
+    middle: Array  # (c,) ... and its own about the expected centroid
 
 
 def holding(covs: Array, smooth: Array, seen: Seen, habits: Habits) -> Array:
@@ -51,7 +52,8 @@ def holding(covs: Array, smooth: Array, seen: Seen, habits: Habits) -> Array:
         block = slice(begin, min(begin + step, n))
         mine = order[first[begin] : first[block.stop]]
         part = Seen(
-            seen.offsets[mine], seen.share[mine], seen.row[mine] - begin, seen.unknown[block], seen.spread[block]
+            *(seen.offsets[mine], seen.share[mine], seen.row[mine] - begin),
+            *(seen.unknown[block], seen.spread[block], seen.middle[block]),
         )
         jumps, is_seen = _jumps(rng, part, habits)
         noise = np.einsum("cij,cbj->cbi", np.linalg.cholesky(_positive(smooth[block])), rng.normal(size=jumps.shape))
@@ -74,7 +76,8 @@ def _jumps(rng: np.random.Generator, seen: Seen, habits: Habits) -> tuple[Array,
     np.add.at(total, seen.row, is_seen[:, :, None] * seen.offsets[:, None])
     np.add.at(count, seen.row, is_seen)
     others = rng.poisson(seen.unknown[:, None] * more_or_less)
-    total += np.sqrt(others * seen.spread[:, None])[:, :, None] * rng.normal(size=total.shape)
+    sigma = np.sqrt(others * seen.spread[:, None] + others**2 * seen.middle[:, None])
+    total += sigma[:, :, None] * rng.normal(size=total.shape)
     count += others
     return total / np.maximum(count, 1.0)[:, :, None], count > 0
 

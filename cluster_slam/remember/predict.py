@@ -11,7 +11,7 @@ from cluster_slam.constellation.growth import DAY_S, at
 from cluster_slam.geometry import Array
 from cluster_slam.records import IntArray, PlantMap
 from cluster_slam.remember.hold import Seen, holding
-from cluster_slam.remember.seen import habits_of, is_real, unknown_flowers
+from cluster_slam.remember.seen import habits_of, is_real, scattered, unknown_flowers
 from tracking.presence import persisted
 
 PRIOR_SPREAD = 2.0  # the plant's mean spread of flowers counts as so many flowers of each cluster
@@ -34,9 +34,11 @@ def predict_plant(plant: PlantMap, time: float, config: MapConfig) -> tuple[Plan
     centres = np.stack([np.bincount(row, share * x, n) for x in moved.flowers.T], axis=1) / weight[:, None]
     offsets = moved.flowers - centres[row]
     unknown, spread = unknown_flowers(plant, weight, habits, time, config), _spread(offsets, row, n)
+    spread = spread * scattered(plant, spread)
     smooth: Array = moved.cluster_covs + _sum(row, n, (share / weight[row]) ** 2, moved.flower_covs)
-    covs = smooth + membership_cov(offsets, share, row, unknown, spread)
-    seen = Seen(offsets, share, row, unknown, spread)
+    middle = spread / np.maximum(np.bincount(row, minlength=n), 1)  # of a cluster, about the few flowers that are known
+    covs = smooth + membership_cov(offsets, share, row, unknown, spread + middle)
+    seen = Seen(offsets, share, row, unknown, spread, middle)
     return replace(moved, clusters=centres), holding(covs, smooth, seen, habits)
 
 

@@ -24,7 +24,8 @@ class Habits:
 
     share: float  # of the flowers that are there
     looks: float  # flowers, prior ones too, that tell the share
-    surprise: float  # times as many flowers as expected nobody knew
+    at_once: float  # times as many hidden and false flowers as expected nobody knew ...
+    since: float  # ... and as many new ones
     surprises: float  # flowers, prior ones too, that tell that
 
 
@@ -62,31 +63,69 @@ def is_real(plant: PlantMap, ghosts: float) -> Array:
 def unknown_flowers(plant: PlantMap, seen: Array, habits: Habits, time: float, config: MapConfig) -> Array:
     """Mean number (c,) of flowers beside a cluster's known ones that will be seen: hidden so far, new, or false.
 
-    ``seen`` (c,) of the known ones will be. A cluster of few known flowers has more hidden ones than its share: sizes
-    are Poisson of a rate that is gamma distributed over the plant, shape r and mean m by their moments, so that with k
-    seen of a part 1 - h that shows, h (k + r) / (1 - h + r / m) are hidden.
+    ``seen`` (c,) of the known ones will be.
     """
     looks = 1.0 + (plant.cluster_last_seen > plant.cluster_first_seen)
-    h = (1.0 - habits.share) ** looks
-    sizes = seen / np.maximum(habits.share * (1.0 - h), 1e-3)
-    mean = max(float(sizes.mean()), 1e-3)
-    shape = float(np.clip(mean**2 / max(float(sizes.var()) - mean, 1e-3), *SHAPES))
-    hidden = h * (seen + habits.share * shape) / (1.0 - h + shape / mean)
     days = np.abs(gaps(plant, time)) / DAY_S
-    unknown: Array = hidden + seen * config.growth.new_per_day * days + config.match.ghosts
-    return unknown * habits.surprise
+    at_once = _hidden(seen, looks, habits.share) + config.match.ghosts
+    unknown: Array = habits.at_once * at_once + habits.since * seen * config.growth.new_per_day * days
+    return unknown
 
 
-def _surprise(plant: PlantMap, seen_share: float, config: MapConfig) -> tuple[float, float]:
-    """How many times more flowers than expected nobody knew when their clusters were last seen, and how many tell."""
+def _hidden(seen: Array, looks: Array, share: float) -> Array:
+    """Mean number (c,) of flowers that some looks missed and the next one sees.
+
+    A cluster of few known flowers has more hidden ones than its share: sizes are Poisson of a rate that is gamma
+    distributed over the plant, shape r and mean m by their moments, so that with k seen of a part 1 - h that shows,
+    h (k + r) / (1 - h + r / m) are hidden.
+    """
+    h = (1.0 - share) ** looks
+    sizes = seen / np.maximum(share * (1.0 - h), 1e-3)
+    mean = max(float(sizes.mean()), 1e-3) if len(sizes) else 1.0
+    shape = float(np.clip(mean**2 / max(float(sizes.var()) - mean, 1e-3), *SHAPES)) if len(sizes) else SHAPES[1]
+    hidden: Array = h * (seen + share * shape) / (1.0 - h + shape / mean)
+    return hidden
+
+
+def _surprise(plant: PlantMap, share: float, config: MapConfig) -> tuple[float, float, float]:
+    """Factors of what nobody knew when clusters were last seen, at once and since, and how many flowers tell.
+
+    Flowers that were hidden or are false come with a look, new ones with time. Which of them one was cannot be told:
+    each counts for both, by what is expected of them (expectation maximisation).
+    """
     row, last = plant.flower_rows, plant.cluster_last_seen
     sessions = np.unique(plant.flower_first_seen)
     before = sessions[np.maximum(np.searchsorted(sessions, last) - 1, 0)] if len(sessions) else last
     again = plant.cluster_first_seen < last
     is_new = plant.flower_first_seen == last[row]
-    n_before = np.bincount(row, ~is_new * plant.flower_presence, len(last))
     found = float(is_new[again[row]].sum())
+    seen = share * np.bincount(row, ~is_new * plant.flower_presence, len(last))
+    looks = 1.0 + (before > plant.cluster_first_seen)
     days = np.nan_to_num(last - np.maximum(before, plant.cluster_first_seen)) / DAY_S
-    expected = n_before * (1.0 - seen_share + config.growth.new_per_day * days) + config.match.ghosts
-    surprise = (PRIOR_SURPRISES + found) / (PRIOR_SURPRISES + float(expected[again].sum()))
-    return surprise, PRIOR_SURPRISES + found
+    at_once = float((_hidden(seen, looks, share) + config.match.ghosts)[again].sum())
+    since = float((seen * config.growth.new_per_day * days)[again].sum())
+    a = b = 1.0
+    for _ in range(N_ROUNDS):
+        part = a * at_once / max(a * at_once + b * since, 1e-12)
+        a = (PRIOR_SURPRISES + part * found) / (PRIOR_SURPRISES + at_once)
+        b = (PRIOR_SURPRISES + (1.0 - part) * found) / (PRIOR_SURPRISES + since)
+    return a, b, PRIOR_SURPRISES + found
+
+
+def scattered(plant: PlantMap, spread: Array) -> float:
+    """Variance of the places of flowers that nobody knew over what is expected of them, as learned from those that came.
+
+    One of a cluster of variance ``spread`` (c,) lies spread (1 + 1 / n) from the middle of n others, along each axis.
+    """
+    order = np.lexsort((plant.flower_first_seen, plant.flower_rows))
+    row, time, place = plant.flower_rows[order], plant.flower_first_seen[order], plant.flowers[order]
+    begin = np.searchsorted(row, row)  # of the cluster, and of the flowers that came with this one
+    with_it = np.append(True, (np.diff(row) > 0) | (np.diff(time) > 0))
+    came = np.maximum.accumulate(np.where(with_it, np.arange(len(row)), 0))
+    later = np.flatnonzero(came > begin)
+    before = (came - begin)[later]
+    total = np.vstack([np.zeros(3), np.cumsum(place, axis=0)])
+    middle = (total[came[later]] - total[begin[later]]) / before[:, None]
+    squared = ((place[later] - middle) ** 2).sum(axis=1) / 3.0
+    expected = np.maximum(spread[row[later]] * (1.0 + 1.0 / before), 1e-12)
+    return (PRIOR_SURPRISES + float((squared / expected).sum())) / (PRIOR_SURPRISES + len(later))
