@@ -79,7 +79,7 @@ def memory_days(plant: PlantMap, config: GrowthConfig) -> float:
 
 
 def unsteady(plant: PlantMap, dt: Array, config: GrowthConfig) -> Array:
-    """Variance (c,) along each axis that a time (s) adds to a place, beside steady drift, on a plant as expected, m^2."""
+    """Variance (c,) along each axis that a time (s) adds to places beside steady drift, on a plant as expected, m^2."""
     dt = np.abs(dt)
     prior = (plant.drift_rate / DAY_S) ** 2 / 3.0
     walked: Array = config.walk_m_per_sqrt_day**2 * dt / DAY_S

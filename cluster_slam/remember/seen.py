@@ -65,7 +65,7 @@ def unknown_flowers(plant: PlantMap, seen: Array, habits: Habits, time: float, c
 
     ``seen`` (c,) of the known ones will be.
     """
-    looks = 1.0 + (plant.cluster_last_seen > plant.cluster_first_seen)
+    looks: Array = np.where(plant.cluster_last_seen > plant.cluster_first_seen, 2.0, 1.0)
     days = np.abs(gaps(plant, time)) / DAY_S
     at_once = _hidden(seen, looks, habits.share) + config.match.ghosts
     unknown: Array = habits.at_once * at_once + habits.since * seen * config.growth.new_per_day * days
@@ -99,8 +99,8 @@ def _surprise(plant: PlantMap, share: float, config: MapConfig) -> tuple[float, 
     again = plant.cluster_first_seen < last
     is_new = plant.flower_first_seen == last[row]
     found = float(is_new[again[row]].sum())
-    seen = share * np.bincount(row, ~is_new * plant.flower_presence, len(last))
-    looks = 1.0 + (before > plant.cluster_first_seen)
+    seen: Array = np.asarray(share * np.bincount(row, ~is_new * plant.flower_presence, len(last)), dtype=np.float64)
+    looks: Array = np.where(before > plant.cluster_first_seen, 2.0, 1.0)
     days = np.nan_to_num(last - np.maximum(before, plant.cluster_first_seen)) / DAY_S
     at_once = float((_hidden(seen, looks, share) + config.match.ghosts)[again].sum())
     since = float((seen * config.growth.new_per_day * days)[again].sum())
@@ -113,7 +113,7 @@ def _surprise(plant: PlantMap, share: float, config: MapConfig) -> tuple[float, 
 
 
 def scattered(plant: PlantMap, spread: Array) -> float:
-    """Variance of the places of flowers that nobody knew over what is expected of them, as learned from those that came.
+    """Variance of the places of flowers that nobody knew over what is expected, as learned from those that came.
 
     One of a cluster of variance ``spread`` (c,) lies spread (1 + 1 / n) from the middle of n others, along each axis.
     """
