@@ -11,7 +11,7 @@ from cluster_slam.localisation import sway
 from cluster_slam.localisation.landmarks import Landmarks
 from cluster_slam.localisation.scene import ErrorScale, Look, covs_at
 from cluster_slam.localisation.shifts import settled
-from cluster_slam.records import IntArray
+from cluster_slam.records import BoolArray, IntArray
 from tracking.assignment import assign
 from tracking.gating import mahalanobis_sq, matching_log_likelihood
 
@@ -69,9 +69,10 @@ def associate(
     largest = np.sqrt(GATE_CHI2 * (np.trace(point_cov, axis1=1, axis2=2).max() + 3.0 * _largest(marks, shared)))
     own = R @ look.covs @ R.T
     drifted = marks.drifted(scale.sway_m)
-    places, covs, free = settled(
-        seen, own, pose, marks.positions, marks.covs, marks.cluster, shared, drifted, null_density
-    )
+    if drifted.any():
+        places, covs, free = _settled(marks, seen, own.mean(0), pose, shared, drifted, null_density)
+    else:
+        places, covs, free = marks.positions, marks.covs + shared[marks.cluster], np.ones(len(marks), bool)
     off = seen[:, None] - places
     i, j = np.nonzero(((off**2).sum(-1) < largest**2) & free)
     if len(i) == 0:
@@ -85,6 +86,16 @@ def associate(
     cost[i, column] = np.where(d2 < GATE_CHI2, -likelihood, np.inf)
     rows, columns = assign(cost, -float(np.log(null_density)))
     return rows, near[columns]
+
+
+def _settled(
+    marks: Landmarks, seen: Array, point_cov: Array, pose_covs: Array, shared: Array, drifted: BoolArray, density: float
+) -> tuple[Array, Array, BoolArray]:
+    """The clusters that have drifted, settled; what the pose is wrong by at each is taken from the point nearest to it."""
+    centres = _sums(marks.positions, marks.cluster, marks.n_clusters) / np.bincount(marks.cluster)[:, None]
+    nearest = ((seen - centres[:, None]) ** 2).sum(-1).argmin(1)
+    with_pose = shared + np.where(drifted[:, None, None], pose_covs[nearest], 0.0)
+    return settled(seen, point_cov, marks.positions, marks.covs, marks.cluster, with_pose, drifted, density)
 
 
 def _largest(marks: Landmarks, shared: Array) -> float:

@@ -93,8 +93,7 @@ def _squares(off: Array, cov: Array) -> Array:
 
 def settled(
     points: Array,
-    point_covs: Array,
-    pose_covs: Array,
+    point_cov: Array,
     places: Array,
     own_covs: Array,
     cluster: IntArray,
@@ -104,17 +103,17 @@ def settled(
 ) -> tuple[Array, Array, BoolArray]:
     """Places (f, 3) and covariances (f, 3, 3) of flowers after their clusters were settled, and which may be matched.
 
-    ``pose_covs`` (n, 3, 3) is what the pose may be wrong by at each point; of the clusters (c,) only ``drifted`` are
-    settled, with ``shared`` (c, 3, 3). Others stay as they are, with the shared covariance added to their own.
+    Of the clusters (c,) only ``drifted`` are settled, ``shared`` (c, 3, 3) is of their displacements, with what the pose
+    may be wrong by there. Others stay as they are, with the shared covariance added to their own; so do those that no
+    point can be of.
     """
     places, covs, free = places.copy(), own_covs + shared[cluster], np.ones(len(places), bool)
-    for c in np.unique(cluster[drifted[cluster]]).tolist():
+    reach = _GATE_CHI2 * (np.trace(covs, axis1=1, axis2=2) + float(np.trace(point_cov)))
+    near = (((points[:, None] - places) ** 2).sum(-1) < reach).any(0)
+    for c in np.flatnonzero(np.bincount(cluster[near], minlength=len(shared)).astype(bool) & drifted).tolist():
         of = np.flatnonzero(cluster == c)
-        near = int(((points - places[of].mean(0)) ** 2).sum(1).argmin())
-        by_pose = pose_covs[near]
-        found = shift_of(
-            points, point_covs.mean(0), places[of], own_covs[of].mean(0), shared[c] + by_pose, null_density
-        )
+        close = (((points[:, None] - places[of]) ** 2).sum(-1) < 4.0 * reach[of]).any(1)
+        found = shift_of(points[close], point_cov, places[of], own_covs[of].mean(0), shared[c], null_density)
         places[of] += found.mean
         covs[of] = own_covs[of] + found.cov
         free[of] = found.is_sure
