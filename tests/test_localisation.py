@@ -308,7 +308,7 @@ def test_the_track_equals_the_batch() -> None:
     motion = motion_of(session)
     T0 = session.poses[0]
     track = start(marks, motion, 0, T0, scale, 0.3)
-    W0 = track.state.W
+    W0 = track.state.W @ track.origin
     assert W0 is not None
     for k in range(4):
         rows = np.flatnonzero(session.observations.frame == k)

@@ -91,9 +91,8 @@ def associate(
 def _settled(
     marks: Landmarks, seen: Array, point_cov: Array, pose_covs: Array, shared: Array, drifted: BoolArray, density: float
 ) -> tuple[Array, Array, BoolArray]:
-    """The clusters that have drifted, settled; what the pose is wrong by at each is taken from the point nearest to it."""
-    centres = _sums(marks.positions, marks.cluster, marks.n_clusters) / np.bincount(marks.cluster)[:, None]
-    nearest = ((seen - centres[:, None]) ** 2).sum(-1).argmin(1)
+    """The clusters that have drifted, settled; what the pose errs by at each is that at the point nearest."""
+    nearest = ((seen - marks.centres[:, None]) ** 2).sum(-1).argmin(1)
     with_pose = shared + np.where(drifted[:, None, None], pose_covs[nearest], 0.0)
     return settled(seen, point_cov, marks.positions, marks.covs, marks.cluster, with_pose, drifted, density)
 

@@ -39,6 +39,13 @@ class Landmarks:
         """Index of each flower's cluster (f,), 0 to n_clusters - 1."""
         return np.unique(self.cluster_ids, return_inverse=True)[1].astype(np.int64)
 
+    @cached_property
+    def centres(self) -> Array:
+        """Mean of each cluster's flowers (c, 3), map, m."""
+        count = np.bincount(self.cluster, minlength=self.n_clusters)
+        sums = np.stack([np.bincount(self.cluster, x, self.n_clusters) for x in self.positions.T], axis=1)
+        return np.asarray(sums / count[:, None])
+
     @property
     def n_clusters(self) -> int:
         return len(self.shared_covs)
@@ -51,8 +58,7 @@ class Landmarks:
     def spread(self) -> float:
         """Standard deviation an axis of a flower about its cluster's centroid, m; 0 where all clusters are single."""
         count = np.bincount(self.cluster, minlength=self.n_clusters)
-        mean = np.stack([np.bincount(self.cluster, x, self.n_clusters) for x in self.positions.T], axis=1)
-        off = self.positions - (mean / count[:, None])[self.cluster]
+        off = self.positions - self.centres[self.cluster]
         free = 3.0 * float((count - 1).sum())
         return float(np.sqrt((off**2).sum() / free)) if free else 0.0
 

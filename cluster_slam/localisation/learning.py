@@ -39,9 +39,8 @@ def learn_scale(seen: Sequence[Seen], prior: ErrorScale) -> ErrorScale:
     scale = prior
     fits = [s.fit for s in seen]
     for _ in range(_N_ROUNDS):
-        ratio_flower = _flower_ratio(fits)
         sway = _sway(seen, fits, scale)
-        factor = float(np.clip(scale.flower_variance * ratio_flower, *_RANGE))
+        factor = float(np.clip(_flower_variance(seen, fits, scale, prior), *_RANGE))
         change = abs(np.log(factor / scale.flower_variance)) + abs(np.log(sway / scale.sway_m))
         scale = replace(scale, flower_variance=factor, sway_m=max(sway, _LEAST_SWAY * prior.sway_m))
         if change < 0.02:
@@ -66,10 +65,21 @@ def learn_scale(seen: Sequence[Seen], prior: ErrorScale) -> ErrorScale:
     )
 
 
-def _flower_ratio(fits: Sequence[Fit]) -> float:
-    observed = sum(float(f.chi2.sum()) for f in fits)
-    expected = sum(f.redundancy for f in fits)
-    return (observed + _PRIOR_DOF) / (expected + _PRIOR_DOF)
+def _flower_variance(seen: Sequence[Seen], fits: Sequence[Fit], scale: ErrorScale, prior: ErrorScale) -> float:
+    """Factor on the points' stated variances: observed squares over the expected ones.
+
+    Where flowers are off by what the map has wrong rather than by how they were measured, their squares say more of the
+    map than of the points: such frames count for the prior.
+    """
+    observed, expected = _PRIOR_DOF * prior.flower_variance, _PRIOR_DOF
+    for s, f in zip(seen, fits, strict=True):
+        measured = np.trace(s.look.covs[f.rows], axis1=1, axis2=2) * scale.flower_variance / prior.flower_variance
+        known = float(np.mean(measured / (measured + np.trace(s.marks.covs[f.flowers], axis1=1, axis2=2))))
+        by_map = (1.0 - known) ** 2
+        observed += (1.0 - by_map) * float(f.chi2.sum()) * scale.flower_variance
+        observed += by_map * f.redundancy * prior.flower_variance
+        expected += f.redundancy
+    return observed / expected
 
 
 def _sway(seen: Sequence[Seen], fits: Sequence[Fit], scale: ErrorScale) -> float:

@@ -27,10 +27,10 @@ def associate(
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     points = np.arange(len(look)) if points is None else points
     flowers = np.arange(len(state.marks)) if flowers is None else flowers
-    R, marks = state.T[:3, :3], state.marks
-    seen = transform(state.T, look.points[points])
+    R, marks = state.V[:3, :3], state.marks
+    seen = transform(state.V, look.points[points])
     point_covs = R @ look.covs[points] @ R.T
-    places = state.places()[flowers]
+    places = state.places(flowers)
     flowers, places = _in_reach(state, look, points, seen, point_covs, flowers, places, sway_m)
     if len(flowers) == 0:
         return flowers, flowers
@@ -58,15 +58,11 @@ def _in_reach(
     sway_m: float,
 ) -> tuple[IntArray, Array]:
     """The flowers of those clusters of which one at least may be near a point, and their places."""
-    marks, P = state.marks, state.P
-    R = state.T[:3, :3]
+    R, marks = state.V[:3, :3], state.marks
     J = np.concatenate([-R @ skew(look.points[points]), np.broadcast_to(R, (len(points), 3, 3))], axis=-1)
-    by_pose = float(np.einsum("nia,ab,nib->n", J, state.pose_cov, J).max())
-    at = state.cluster_at[state.cluster_at >= 0, None] + np.arange(6)
-    displaced = 2.0 * float(P[at, at].sum(1).max()) if len(at) else 0.0
-    prior = float(np.trace(marks.shared_covs, axis1=1, axis2=2).max()) + 3.0 * sway_m**2
-    own = float(np.trace(marks.covs, axis1=1, axis2=2).max() + np.trace(point_covs, axis1=1, axis2=2).max())
-    reach = GATE_CHI2 * (2.0 * by_pose + max(2.0 * displaced, prior) + own)
+    by_pose = float(np.einsum("nia,ab,nib->n", J, state.P[:6, :6], J).max())
+    own = float(np.trace(point_covs, axis1=1, axis2=2).max())
+    reach = GATE_CHI2 * (2.0 * by_pose + 2.0 * state.most_off(sway_m) + own)
     near = (((seen[:, None] - places) ** 2).sum(-1) < reach).any(0)
     kept = np.isin(marks.cluster[flowers], marks.cluster[flowers[near]])
     return flowers[kept], places[kept]

@@ -2,7 +2,8 @@
 
 A cluster that may have drifted by as much as its flowers lie apart cannot be matched flower by flower: each alone
 would take the nearest. Its flowers moved together, so every pair of a point and a flower proposes a displacement, and
-what the others say of it decides. Where two displacements explain the frame about as well the cluster is left alone.
+what the others say of it decides. Where two displacements explain the frame about as well, or flowers that the map does
+not have explain it about as well as any, the cluster is left alone.
 """
 
 from __future__ import annotations
@@ -54,11 +55,17 @@ def shift_of(
     white: Array = np.asarray(np.linalg.solve(L, off[near].reshape(-1, 3).T).T, dtype=np.float64)
     white_seeds: Array = np.asarray(np.linalg.solve(L, seeds.T).T, dtype=np.float64)
     gains = _gains(white.reshape(-1, len(places), 3), white_seeds, L, null_density)
-    scores = gains.sum(1) - 0.5 * prior_d2[i, j]
+    room = (
+        np.linalg.slogdet(2.0 * V)[1] - np.linalg.slogdet(shared + V)[1]
+    )  # a displacement may be any, a point just so
+    scores = gains.sum(1) - 0.5 * (prior_d2[i, j] - room)
     best = int(scores.argmax())
     alike = ((white_seeds - white_seeds[best]) ** 2).sum(1) < 2.0 * _GATE_CHI2
     other = scores[~alike].max() if (~alike).any() else -np.inf
-    is_sure = bool(1.0 / (1.0 + np.exp(min(other - scores[best], 50.0))) >= _SURE)
+    odds = np.exp(
+        np.minimum([other - scores[best], -scores[best]], 50.0)
+    )  # another displacement; or none of its flowers
+    is_sure = bool(1.0 / (1.0 + odds.sum()) >= _SURE)
     return _settled(off[near], seeds[best], V, shared, is_sure)
 
 
@@ -103,9 +110,9 @@ def settled(
 ) -> tuple[Array, Array, BoolArray]:
     """Places (f, 3) and covariances (f, 3, 3) of flowers after their clusters were settled, and which may be matched.
 
-    Of the clusters (c,) only ``drifted`` are settled, ``shared`` (c, 3, 3) is of their displacements, with what the pose
-    may be wrong by there. Others stay as they are, with the shared covariance added to their own; so do those that no
-    point can be of.
+    Of the clusters (c,) only ``drifted`` are settled; ``shared`` (c, 3, 3) is of their displacements, with what the
+    pose may be wrong by there. Others stay as they are, with the shared covariance added to their own; so do those
+    that no point can be of.
     """
     places, covs, free = places.copy(), own_covs + shared[cluster], np.ones(len(places), bool)
     reach = _GATE_CHI2 * (np.trace(covs, axis1=1, axis2=2) + float(np.trace(point_cov)))

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.linalg.blas import dtrsm
 
-from cluster_slam.geometry import Array, adjoint, inverse, se3_exp, se3_log
+from cluster_slam.geometry import Array, adjoint, inverse, se3_log
 from cluster_slam.localisation import sway
 from cluster_slam.localisation.fit import LOG_2PI
 from cluster_slam.localisation.landmarks import Landmarks
@@ -53,6 +53,7 @@ class Track:
     scale: ErrorScale
     sway_time_s: float
     frame: int
+    origin: Array  # (4, 4) from the world of the given poses to the state's
     swing_m: Array = field(default_factory=lambda: np.zeros(0))  # (c,) how far each cluster was seen to swing of late
     seen_s: Array = field(default_factory=lambda: np.zeros(0))  # (c,)
 
@@ -85,25 +86,22 @@ class Track:
     def _pose_transition(self, frame: int) -> tuple[Array, Array]:
         """Rows (6, n_poses) that the new camera tangent has of the old pose state, and what is added to its covariance.
 
-        Moves ``T`` too. Absolute poses: T = W F Exp(e) X. Odometry: T' = T X^-1 (F^-1 F') Exp(e) X.
+        Moves ``V`` too. Absolute poses: V = F Exp(e) X. Odometry: V' = V X^-1 (F^-1 F') Exp(e) X.
         """
         state, motion, X = self.state, self.motion, self.state.X
-        at_x = 6 if state.W is None else 12
-        F = np.zeros((6, at_x + (0 if X is None else 6)))
+        F = np.zeros((6, 12 if X is None else 18))
         lever = np.eye(6) if X is None else adjoint(inverse(X))
-        if state.W is not None:
-            seen = motion.camera_in_world(frame, X)
-            state.T = state.W @ seen
-            F[:, 6:12] = adjoint(inverse(seen))
+        if not motion.is_odometry:
+            state.V = self.origin @ motion.camera_in_world(frame, X)
             if X is not None:
-                F[:, at_x:] = np.eye(6)
+                F[:, 12:] = np.eye(6)
             cov = motion.cov * self.scale.pose_variance
         else:
             moved = motion.camera_step(self.frame, frame, X)
-            state.T = state.T @ moved
+            state.V = state.V @ moved
             F[:, :6] = adjoint(inverse(moved))
             if X is not None:
-                F[:, at_x:] = np.eye(6) - F[:, :6]
+                F[:, 12:] = np.eye(6) - F[:, :6]
             cov = motion.step_cov(self.frame, frame) * self.scale.pose_variance
         return F, lever @ cov @ lever.T
 
@@ -143,7 +141,7 @@ class Track:
         clusters = np.unique(state.marks.cluster[flowers])
         state.meet(clusters, self.scale.sway_m)
         self.seen_s[clusters] = float(self.motion.stamps[self.frame])
-        begin = state.T, state.W, state.X, state.d
+        begin = state.means
         moved = np.zeros(len(state.P))
         log_likelihood = nis = 0.0
         for iteration in range(n_iterations):
@@ -203,13 +201,13 @@ class Track:
     def step(self, frame: int, look: Look, null_density: float) -> Step:
         """Take the next frame in."""
         added = self.predict(frame)
-        predicted, before = self.T, self.pose_cov.copy()
+        predicted, before = self.T, self.pose_cov
+        V, cov = self.state.V, self.state.P[:6, :6].copy()
         rows, flowers = associate(self.state, look, self.scale.sway_m, null_density)
         log_likelihood, nis = self.update(look, rows, flowers) if len(rows) else (0.0, 0.0)
         rows, flowers = self._followed_up(look, rows, flowers, null_density)
-        after = self.pose_cov.copy()
-        surprise = _pose_surprise(added, before, after, se3_log(inverse(predicted) @ self.T))
-        return Step(frame, self.T, after, rows, flowers, predicted, before, log_likelihood, nis, *surprise)
+        surprise = _pose_surprise(added, cov, self.state.P[:6, :6], se3_log(inverse(V) @ self.state.V))
+        return Step(frame, self.T, self.pose_cov, rows, flowers, predicted, before, log_likelihood, nis, *surprise)
 
 
 def _with_blocks(S: Array, V: Array) -> Array:
@@ -242,17 +240,12 @@ def start(
 ) -> Track:
     """A track that begins at a frame near a pose, about which next to nothing is believed yet."""
     X = motion.X0
-    W = None if motion.is_odometry else T_map_camera @ inverse(motion.camera_in_world(frame, X))
-    n = 6 + (0 if W is None else 6) + (0 if X is None else 6)
-    P = np.zeros((n, n))
-    about = np.diag(_DIFFUSE**2)
+    P = np.zeros((12, 12) if X is None else (18, 18))
+    P[6:12, 6:12] = np.diag(_DIFFUSE**2)
     if X is not None:
-        P[n - 6 :, n - 6 :] = motion.cov_hand_eye
-    if W is None:
-        P[:6, :6] = about
-    else:  # the pose of the first frame is what is vague; T_map_world follows from it
-        P[6:12, 6:12] = adjoint(motion.camera_in_world(frame, X)) @ about @ adjoint(motion.camera_in_world(frame, X)).T
-    track = Track(State(marks, T_map_camera, W, X, P), motion, scale, sway_time_s, frame)
-    if W is not None:
+        P[12:, 12:] = motion.cov_hand_eye
+    state = State(marks, np.eye(4), T_map_camera, X, P)
+    track = Track(state, motion, scale, sway_time_s, frame, inverse(motion.camera_in_world(frame, X)))
+    if not motion.is_odometry:
         track.predict(frame)
     return track
