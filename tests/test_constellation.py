@@ -16,6 +16,7 @@ from cluster_slam.constellation.growth import DAY_S, at
 from cluster_slam.constellation.identify import nobody
 from cluster_slam.constellation.match import match
 from cluster_slam.constellation.plane import plane_frame, spaces
+from cluster_slam.constellation.search import candidates_of
 from cluster_slam.constellation.similarity import align
 from cluster_slam.geometry import Array, inverse, se3_exp, se3_log, so3_exp, transform
 from cluster_slam.records import Constellation, PlantMap
@@ -237,6 +238,20 @@ def test_flat_scenes_are_matched_in_their_plane() -> None:
     np.testing.assert_allclose(transform(found.T_map_world, found.scale * moved)[:, :2], points[:, :2], atol=0.02)
     mirrored = replace(session, flowers=moved * [-1.0, 1.0, 1.0])
     assert decide(mirrored, [known], CONFIG, similarity=True).accepted is None
+
+
+def test_a_pose_counts_for_both_ways_of_drifting() -> None:
+    """Clusters as a whole or flowers one by one, each as likely beforehand: of six single ones both say the same."""
+    rng = np.random.default_rng(3)
+    points = np.hstack([rng.uniform(-0.5, 0.5, (6, 2)), np.zeros((6, 1))])
+    known = plant_of(session_of(points, np.arange(6)))
+    moved = points + np.hstack([rng.normal(0.0, 0.004, (6, 2)), np.zeros((6, 1))])
+    session = session_of(moved, np.arange(6), DAY_S)
+    later = at(known, DAY_S)
+    candidates, _ = candidates_of(session, later, MapConfig().match, GrowthConfig(), similarity=True)
+    each = [max(c.evidence for c in candidates if c.single == single) for single in (False, True)]
+    found = match(session, later, similarity=True)
+    np.testing.assert_allclose(found.evidence, np.log(0.5 * np.exp(each[0]) + 0.5 * np.exp(each[1])), rtol=1e-9)
 
 
 def test_the_side_of_a_plane() -> None:

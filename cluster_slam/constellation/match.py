@@ -83,7 +83,7 @@ def match(
     others = [c.evidence for c in candidates if _says_something_else(chosen, c)]
     name, runner_up = plant.name, max(others, default=-np.inf)
     found = _found(session, alive, chosen)
-    return Match(name, chosen.found.log_ratio, chosen.evidence, runner_up, repeated, found)
+    return Match(name, chosen.found.log_ratio, _evidence(candidates, chosen), runner_up, repeated, found)
 
 
 def _best(candidates: list[Candidate]) -> Candidate:
@@ -95,6 +95,19 @@ def _best(candidates: list[Candidate]) -> Candidate:
     alike = [c for c in candidates if not c.single and c.evidence > best.evidence - CLEARLY]
     alike = [c for c in alike if not _says_something_else(best, c)] if best.single else []
     return max(alike, key=lambda c: c.evidence, default=best)
+
+
+def _evidence(candidates: list[Candidate], chosen: Candidate) -> float:
+    """Log of the Bayes factor of a pose, whether clusters drift as a whole or flowers one by one: nobody knows which."""
+    each = [
+        max(
+            (c.evidence for c in candidates if c.single == single and not _says_something_else(chosen, c)), default=None
+        )
+        for single in (False, True)
+        if any(c.single == single for c in candidates)
+    ]
+    found = [-np.inf if e is None else e for e in each]
+    return float(np.logaddexp.reduce(found) - np.log(len(found)))
 
 
 def _says_something_else(best: Candidate, other: Candidate) -> bool:
