@@ -98,16 +98,11 @@ def _best(candidates: list[Candidate]) -> Candidate:
 
 
 def _evidence(candidates: list[Candidate], chosen: Candidate) -> float:
-    """Log of the Bayes factor of a pose, whether clusters drift as a whole or flowers one by one: nobody knows which."""
-    each = [
-        max(
-            (c.evidence for c in candidates if c.single == single and not _says_something_else(chosen, c)), default=None
-        )
-        for single in (False, True)
-        if any(c.single == single for c in candidates)
-    ]
-    found = [-np.inf if e is None else e for e in each]
-    return float(np.logaddexp.reduce(found) - np.log(len(found)))
+    """Log of the Bayes factor of a pose: clusters drift as a whole or flowers one by one, nobody knows which."""
+    alike = [c for c in candidates if not _says_something_else(chosen, c)]
+    ways = {c.single for c in candidates}
+    each = [max((c.evidence for c in alike if c.single == way), default=-np.inf) for way in sorted(ways)]
+    return float(np.logaddexp.reduce(each) - np.log(len(each)))
 
 
 def _says_something_else(best: Candidate, other: Candidate) -> bool:
