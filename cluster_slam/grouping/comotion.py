@@ -30,7 +30,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from cluster_slam.geometry import Array
-from cluster_slam.grouping.lasting import SPELL_S, lasting_share, without_lasting
+from cluster_slam.grouping.lasting import REMAINS, SPELL_S, lasting_share, without_lasting
 from cluster_slam.records import BoolArray, IntArray
 
 _WINDOW_S = 0.4  # motion hardly changes for so long
@@ -96,13 +96,11 @@ def motion_evidence(places: Array, motion: Motion, reach: float) -> csr_matrix:
 
 def _less_lasting(places: Array, motion: Motion) -> tuple[Motion, float]:
     """Without what stays the same for a spell, if errors do so; share of what still lasts for a stretch."""
-    u, var, spells = motion.u, motion.var, _stretches(motion.stamps, SPELL_S)
     # Sway averages out over a spell: it is not taken for lasting errors, even where all neighbours move apart.
-    slow = lasting_share(places, u, var, var, spells)
-    if slow == 0.0:
+    share = lasting_share(places, motion.u, motion.var, _stretches(motion.stamps, SPELL_S))
+    if share == 0.0:
         return motion, 0.0
-    u, left = without_lasting(u, var, motion.stamps, slow)
-    return Motion(u, left, motion.stamps), min(slow, lasting_share(places, u, var, left, _stretches(motion.stamps)))
+    return Motion(*without_lasting(motion.u, motion.var, motion.stamps, share), motion.stamps), REMAINS * share
 
 
 def log_likelihood_ratio(ratios: Ratios, turning: Array | float) -> Array:

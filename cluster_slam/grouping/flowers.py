@@ -21,8 +21,10 @@ from cluster_slam.grouping.partition import improve, likeliest_cut
 from cluster_slam.records import IntArray
 
 _TOGETHER = 0.62  # share of a flower's frames that show its nearest, too: 0.7 to 0.97 of clusters, 0.37 to 0.55 of none
-_CLUSTER = 3  # members of what is certainly called a cluster
-_SURE = 3.0  # log-likelihood, 20 to 1, that there are clusters
+_SURE = 3.0  # log-likelihood, 20 to 1, that flowers move as one
+_LIKELIER = (
+    1.0  # as much the likeliest of all partitions gains in one of twelve draws of six flowers that are all loose
+)
 _REACH = 7.0  # spacings; flowers that far apart are of two clusters, whatever they do
 
 
@@ -60,9 +62,7 @@ def group_flowers(
     tree = _tree(places, evidence, "single" if config.method == "branch" else "average")
     if config.linkage_m is not None:
         return _numbered(fcluster(tree, config.linkage_m, "distance"))
-    likelihood = Likelihood(places, view_volume, spacing, evidence)
-    label = likeliest_cut(tree, likelihood)
-    likelihood.knowing(len(np.unique(label)))
+    likelihood = Likelihood(places, view_volume, evidence)
     label = likeliest_cut(tree, likelihood)
     if config.method == "spacing":
         label = improve(label, likelihood)
@@ -96,15 +96,12 @@ def _come_in_clusters(places: Array, presence: csr_matrix, label: IntArray, like
     """Whether this session's flowers come in clusters at all.
 
     They do where they move as one, however seldom they are seen together; and where they are seen together and stand
-    nearer than flowers that are all loose would. Plants have clusters, so the likeliest partition is believed where it
-    has some of three; pairs alone are often chance, and must be likelier for sure.
+    nearer than flowers that are all loose would.
     """
-    members = members_by_label(label)
-    clustered = likelihood.sums(members.values())
+    clustered = likelihood.sums(members_by_label(label).values())
     if clustered.motion > _SURE:
         return True
-    wanted = 0.0 if max(map(len, members.values())) >= _CLUSTER else _SURE
-    if likelihood.of(clustered) - likelihood(np.arange(len(places))) < wanted:
+    if likelihood.of(clustered) - likelihood(np.arange(len(places))) < _LIKELIER:
         return False
     nearest = np.asarray(cKDTree(places).query(places, k=2)[1])[:, 1]
     both = np.asarray(presence.multiply(presence[nearest]).sum(axis=1)).ravel()

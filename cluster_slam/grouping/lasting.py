@@ -23,25 +23,25 @@ _MEDIAN = float(chi2.ppf(0.5, 3))
 _LARGEST = 100.0  # of the variance of an observation
 _STEPS = 40  # of a bisection
 SPELL_S = 2.0  # half of a turn about a plant takes longer, a period of sway does not
+REMAINS = 1.0 / 3.0  # of the variance of errors whose correlation falls to 1 / e in a third of a spell
 _TAIL = 10.0  # as many times its usual variance a lasting error may have
 _LEFT = 0.5  # of the noise of one observation
 
 
 class Moments(NamedTuple):
-    """Differences of neighbours, averaged over moments (k,): squared, over the mean variance of one frame."""
+    """Differences of neighbours, averaged over moments (k,): squared over the mean variance of one frame; frames."""
 
     square: Array
-    expected: Array  # of noise alone, along an axis
+    n_frames: Array
 
 
-def lasting_share(places: Array, u: Array, var: Array, left: Array, moment: IntArray) -> float:
+def lasting_share(places: Array, u: Array, var: Array, moment: IntArray) -> float:
     """Variance of the errors that last for a moment, over the variance of one observation.
 
-    Flowers at ``places`` (l, 3) were displaced by ``u`` (n, l, 3) with noise ``var`` (n, l), of which ``left`` (n, l)
-    is left where something was subtracted from u; ``moment`` (n,) of each frame. The median over all moments of all
-    pairs does not mind the moments in which neighbours do move apart.
+    Flowers at ``places`` (l, 3) were displaced by ``u`` (n, l, 3) with noise ``var`` (n, l); ``moment`` (n,) of each
+    frame. The median over all moments of all pairs does not mind those in which neighbours do move apart.
     """
-    moments = _moments(places, u, var, left, moment)
+    moments = _moments(places, u, var, moment)
     low, high = 0.0, _LARGEST
     if len(moments.square) == 0 or _median(moments, low) <= _MEDIAN:
         return 0.0
@@ -52,31 +52,26 @@ def lasting_share(places: Array, u: Array, var: Array, left: Array, moment: IntA
 
 
 def _median(moments: Moments, share: float) -> float:
-    return float(np.median(moments.square / (moments.expected + share)))
+    return float(np.median(moments.square / (1.0 / moments.n_frames + share)))
 
 
-def _moments(places: Array, u: Array, var: Array, left: Array, moment: IntArray) -> Moments:
+def _moments(places: Array, u: Array, var: Array, moment: IntArray) -> Moments:
     """Of each flower and its nearest."""
     nearest = np.asarray(cKDTree(places).query(places, k=2)[1])[:, 1]
     pairs = np.unique(np.sort(np.column_stack([np.arange(len(places)), nearest]), axis=1), axis=0)
-    found = [
-        _moments_of(u[:, f] - u[:, g], var[:, f] + var[:, g], left[:, f] + left[:, g], moment)
-        for f, g in pairs.tolist()
-    ]
+    found = [_moments_of(u[:, f] - u[:, g], var[:, f] + var[:, g], moment) for f, g in pairs.tolist()]
     return Moments(*(np.concatenate(x) for x in zip(*found, strict=True)))
 
 
-def _moments_of(difference: Array, var: Array, left: Array, moment: NDArray[np.int64]) -> Moments:
-    k = np.flatnonzero(np.isfinite(left))
+def _moments_of(difference: Array, var: Array, moment: NDArray[np.int64]) -> Moments:
+    k = np.flatnonzero(np.isfinite(var))
     weight, of = 1.0 / var[k], moment[k]
     n_frames = np.bincount(of).astype(float)
     enough = n_frames >= _FEWEST
     information = np.bincount(of, weight)[enough]
-    # A mean over a spell, subtracted, takes as large a part of the moment's noise as of all its frames together.
-    kept = np.maximum(1.0 - np.bincount(of, 1.0 - left[k] / var[k])[enough], _LEFT)
     n_frames = n_frames[enough]
     mean = np.stack([np.bincount(of, weight * difference[k, a])[enough] for a in range(3)]) / information
-    return Moments((mean**2).sum(axis=0) * information / n_frames, kept / n_frames)
+    return Moments((mean**2).sum(axis=0) * information / n_frames, n_frames)
 
 
 def without_lasting(u: Array, var: Array, stamps: Array, share: float) -> tuple[Array, Array]:

@@ -1,6 +1,6 @@
 """How likely a partition of flowers into clusters is, from where they stand and from what their motion says.
 
-Clusters stand anywhere in the space that was looked at; members scatter about their centroid with one sigma for all
+Clusters stand anywhere in a box around the flowers; members scatter about their centroid with one sigma for all
 clusters; the number of members is Poisson, and some flowers are loose. To this comes the evidence of each pair within a
 cluster; of the pairs among n members that pairs tie together at most n - 1 say something new, so that they weigh no
 more than that together. Members of whom no pair is known add nothing to it.
@@ -8,23 +8,29 @@ more than that together. Members of whom no pair is known add nothing to it.
 Neither clusters nor members come in an order: the density of c clusters in a volume V is c! / V^c, and that of n
 members n! times their number's probability (a Neyman-Scott process; Daley and Vere-Jones, "An introduction to the
 theory of point processes", 2003, section 6.3). It matters where clusters are many.
+
+Neither the sides of the box nor sigma are known, and the likelihood is the mean over what they may be: where flowers
+are few their own extent and spacing say little, and a likelihood at the best value would find clusters in any few.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import lru_cache
-from math import exp, expm1, lgamma, log
+from math import exp, expm1, lgamma, log, pi
 from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.special import log_ndtr
 
 from cluster_slam.geometry import Array
 from cluster_slam.records import BoolArray, IntArray
 
-_FEW = 3.0  # clusters
+_SIDE = 0.5  # sigma of the log of a side of the plant's box, about that of what one look of the camera holds
+_THIN = 0.1  # of the longest side: no box is thinner
+_SMALLEST = 0.01  # sigma of members is anywhere from this to all of the side of what one look holds, in logs
 _PRIOR_SIZES = 30.0  # clusters: fewer say nothing certain of what sizes there are
 _LOOSE = 0.25  # of the clusters, before the data
 _USUAL_SIZE = 4.5  # members, before the data
@@ -42,28 +48,21 @@ class Sums(NamedTuple):
 class Likelihood:
     """Log-likelihood of partitions of flowers at ``places`` (l, 3); members of a cluster are sorted indices."""
 
-    def __init__(self, places: Array, volume: float, spacing: float, evidence: csr_matrix | None) -> None:
-        """``volume`` m^3 that was looked at, ``spacing`` m to the nearest flower, ``evidence`` (l, l) of motion."""
-        sides = np.ptp(places, axis=0)
+    def __init__(self, places: Array, volume: float, evidence: csr_matrix | None) -> None:
+        """``volume`` m^3 that one look of the camera holds, ``evidence`` (l, l) of motion."""
+        n = len(places)
         self.places = places
-        k, n = max(len(places), 3), len(places)
-        # The range of k points in a box is (k - 1) / (k + 1) of its side.
-        self.box = float(np.prod(np.maximum(sides, 0.1 * sides.max()) * (k + 1.0) / (k - 1.0)))
-        self.view = volume
-        self.log_volume = float(np.log(max(self.box, volume)))
-        self.prior_sigma = 0.7 * spacing
+        self.log_view_side = log(volume) / 3.0
+        sides = np.ptp(places, axis=0)
+        self.log_sides = np.log(np.maximum(np.maximum(sides, _THIN * sides.max()), _SMALLEST * volume ** (1.0 / 3.0)))
         self.known: BoolArray = np.zeros((n, n), dtype=bool)
         self.evidence: Array = np.zeros((n, n))
         if evidence is not None:
             pairs = evidence.tocoo()
             self.known[pairs.row, pairs.col] = pairs.row != pairs.col
             self.evidence[pairs.row, pairs.col] = np.where(pairs.row != pairs.col, pairs.data, 0.0)
+        self._anywhere_of: dict[int, float] = {}
         self._known_of: dict[bytes, tuple[float, float]] = {}  # of clusters: most are the same in many partitions
-
-    def knowing(self, n_clusters: int) -> None:
-        """Take the flowers' own extent for that of the plant, as far as so many clusters tell it."""
-        few, c = _FEW * np.log(self.view), n_clusters * np.log(self.box)
-        self.log_volume = float((few + c) / (_FEW + n_clusters))
 
     def __call__(self, label: IntArray) -> float:
         """Of the clusters that ``label`` (l,) names with any integers."""
@@ -84,14 +83,29 @@ class Likelihood:
                 sizes[len(members)] = sizes.get(len(members), 0) + sign
         return Sums(square, motion, sizes)
 
-    def of(self, sums: Sums, prior_weight: float = 1.0) -> float:
-        """Sigma takes its most probable value; a weak prior keeps it from zero."""
-        n, c = len(self.places), sum(sums.sizes.values())
-        dof = 3.0 * (n - c)
-        var = (sums.square + 3.0 * prior_weight * self.prior_sigma**2) / (dof + 3.0 * prior_weight)
-        scatter = -0.5 * dof * log(2.0 * np.pi * var) - 0.5 * sums.square / var
-        scatter -= 1.5 * sum(count * log(size) for size, count in sums.sizes.items())
-        return scatter + lgamma(c + 1.0) - c * self.log_volume + _log_sizes(sums.sizes) + sums.motion
+    def of(self, sums: Sums) -> float:
+        """Of a partition with these sums."""
+        c = sum(sums.sizes.values())
+        return self._scatter(sums) + lgamma(c + 1.0) + self._anywhere(c) + _log_sizes(sums.sizes) + sums.motion
+
+    def _scatter(self, sums: Sums) -> float:
+        """Log-density of members about their centroids, the log of sigma being uniform."""
+        half_dof = 1.5 * (len(self.places) - sum(sums.sizes.values()))
+        if half_dof == 0.0:
+            return 0.0
+        # The integral goes over all sigmas; one more square as large as the least of them keeps it finite.
+        square = sums.square + 3.0 * (_SMALLEST * exp(self.log_view_side)) ** 2
+        prior = -log(-2.0 * log(_SMALLEST))
+        centroids = 1.5 * sum(count * log(size) for size, count in sums.sizes.items())
+        return lgamma(half_dof) - half_dof * log(pi * square) + prior - centroids
+
+    def _anywhere(self, c: int) -> float:
+        """Log-density of c clusters in a box that is as large as all flowers or larger; its sides are log-normal."""
+        if c not in self._anywhere_of:
+            most = (self.log_view_side - c * _SIDE**2 - self.log_sides) / _SIDE
+            each = 0.5 * (c * _SIDE) ** 2 - c * self.log_view_side + log_ndtr(most)
+            self._anywhere_of[c] = float(each.sum())
+        return self._anywhere_of[c]
 
     def _cluster(self, members: IntArray) -> tuple[float, float]:
         """Square and motion of one cluster."""
