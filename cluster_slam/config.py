@@ -69,7 +69,7 @@ class ParticleConfig:
     n_particles: int = 60  # for a stretch; twice as many after a gap
     n_tries: int = 3  # of a stretch after a gap; the best is kept
     stretch_points: int = 100  # points that are associated before all is smoothed again
-    n_redo: int = 2  # passes in which every stretch is associated again, at most
+    n_redo: int = 3  # passes in which every stretch is associated again, at most
     ahead_points: int = 40  # that are looked at beyond, before a stretch is believed
     odometry_scale: float = 1.5  # stated sigmas of odometry are taken times this ...
     odometry_dof: float = 2.0  # ... and errors of a usual step from Student's t: wheels slip, clocks are late
@@ -79,8 +79,8 @@ class ParticleConfig:
     new_share: float = 1e-4  # of points that found a landmark, before the data
     clutter_share: float = 1e-5  # of points that are false
     clutter_cost: float = 20.0  # chi-square at which a point is no landmark's
-    growing_cost: float = 40.0  # chi-square that a new landmark must save while the map grows ...
-    landmark_cost: float = 80.0  # ... and in the end: errors repeat, so a place that few points like better is none
+    growing_cost: float = 20.0  # chi-square that a new landmark must save while the map grows ...
+    landmark_cost: float = 40.0  # ... and in the end: errors repeat, so a place that few points like better is none
     merge_reach_m: float = 0.8  # landmarks so close are tried as one
 
 

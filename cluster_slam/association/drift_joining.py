@@ -15,9 +15,10 @@ import numpy as np
 from cluster_slam.association.compatibility import match_jointly
 from cluster_slam.association.drift_growth import grow
 from cluster_slam.association.drift_labels import State
-from cluster_slam.association.drift_redo import redo_once
+from cluster_slam.association.drift_redo import redo, redo_once
 from cluster_slam.association.drift_session import DriftSession
 from cluster_slam.association.drift_smoother import DriftSmoother
+from cluster_slam.association.drift_split import split
 from cluster_slam.association.particles import view_cells
 from cluster_slam.association.submaps import (
     Part,
@@ -56,8 +57,10 @@ def _maps(session: DriftSession, first: int, end: int) -> list[Part]:
     n = len(piece.frames)
     if n < session.config.fewest_points:
         return [as_part(piece, State(piece.given, np.full(n, -1), np.empty((0, 3)), 0.0), first)]
-    grown = [grow(piece) for _ in range(session.config.n_maps)]
-    return [as_part(piece, state, first) for state in _best(grown, session.config.n_maps)]
+    price, n_maps = session.config.growing_cost, session.config.n_maps
+    grown = _best([grow(piece) for _ in range(n_maps)], n_maps, 2.0 * session.config.lead)
+    again = [redo(piece, state, price, _FEW_MERGES) for state in grown]
+    return [as_part(piece, state, first) for state in _best(again, n_maps)]
 
 
 def as_part(session: DriftSession, state: State, first: int) -> Part:
@@ -85,7 +88,8 @@ def _joined(session: DriftSession, large: list[Part], small: list[Part]) -> list
     likely = _best(ways, config.n_wholes, 2.0 * config.lead)
     again = [redo_once(union, way, span, price, _FEW_MERGES) for way in likely]
     best = _best(again, config.n_wholes, config.lead, _ALIKE)
-    return [as_part(union, way, first) for way in _best([union.labels.merge(way, price) for way in best], len(best))]
+    parted = [split(union.labels, union.labels.merge(way, price), price) for way in best]
+    return [as_part(union, way, first) for way in _best(parted, len(best))]
 
 
 def _ways(session: DriftSession, large: list[Part], small: list[Part]) -> list[Part]:

@@ -65,7 +65,7 @@ class Labelling:
 
     def settle(self, T: Array, label: IntArray, places: Array, price: float, n_rounds: int = 3) -> State:
         """Smooth, associate again, until nothing changes."""
-        smoother = self._smoother(len(T))
+        smoother = self.smoother(len(T))
         places, label = _compact(places, label)
         for _ in range(n_rounds):
             T, places = smoother.solve(T, places, label)
@@ -79,7 +79,8 @@ class Labelling:
         cost = smoother.cost(T, places, label) + clutter + price * len(places) + self.choice_cost(T, places, label)
         return State(T, label, places, cost)
 
-    def _smoother(self, n: int) -> DriftSmoother:
+    def smoother(self, n: int) -> DriftSmoother:
+        """What smooths the first n frames."""
         f = self.frames
         k = int(f.starts[n])
         part = Frames(f.order[:k], f.starts[: n + 1], f.frame[:k], f.points[:k], f.covs[:k], f.stamps[:n])

@@ -9,15 +9,17 @@ import numpy as np
 from cluster_slam.association.drift_labels import State
 from cluster_slam.association.drift_session import DriftSession
 from cluster_slam.association.drift_smoother import DriftSmoother
+from cluster_slam.association.drift_split import split
 from cluster_slam.association.particles import trace_stretch
 from cluster_slam.geometry import Array
 from cluster_slam.records import IntArray
 
 
-def redo(session: DriftSession, state: State) -> State:
-    """Associate every stretch again, as long as that helps."""
+def redo(session: DriftSession, state: State, price: float, n_merges: int = 12) -> State:
+    """Associate every stretch again, and part landmarks that are two, as long as that helps; landmarks have a price."""
     for _ in range(session.config.n_redo):
-        new = redo_once(session, state, (0, session.frames.n_frames), session.config.landmark_cost)
+        new = redo_once(session, state, (0, session.frames.n_frames), price, n_merges)
+        new = split(session.labels, new, price)
         if new.cost >= state.cost - 1.0:
             break
         state = new

@@ -99,7 +99,7 @@ def _searched(
     wholes = [_priced(rough, state) for state in assemble(rough)]
     fine = DriftSession(seen, late, steps, config, rng, view)
     start = min((_priced(fine, state) for state in wholes), key=lambda state: state.cost)
-    return redo(fine, start)
+    return redo(fine, start, config.landmark_cost)
 
 
 def _priced(session: DriftSession, state: State) -> State:
