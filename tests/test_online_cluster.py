@@ -54,7 +54,7 @@ def follow(track: ClusterTrack, true: np.ndarray, rng: np.random.Generator) -> n
 
 def followed(true: np.ndarray, seed: int) -> np.ndarray:
     track = ClusterTrack(1, 0.0, MotionConfig())
-    track.place(np.zeros(3))
+    track.place(np.zeros(3), 4)
     track.awaken(0.0)
     return follow(track, true, np.random.default_rng(seed))
 

@@ -57,14 +57,16 @@ def test_innovation_changes_nothing_and_agrees_with_the_update() -> None:
 
 
 def test_sway_is_predicted_with_true_covariances_and_its_frequency_is_found() -> None:
-    """NIS of one frame ahead inside its band over 40 shakes of known kind; frequency to a tenth."""
+    """NIS of one frame ahead inside its band over 40 shakes of known kind; frequency to a tenth, place at rest."""
     config, rng = MotionConfig(), np.random.default_rng(1)
     dt, R, anchor, nis, hz = 1 / 30, 1e-6 * np.eye(3), np.zeros(3), [], []
+    away = []
     for _ in range(40):
         x, P = state_at_rest(anchor, config)
         x[7] += rng.normal() * config.sway_log_sigma
         P[3:6, 3:6] = 0.15**2 * np.eye(3)
-        true = x + np.linalg.cholesky(P) @ rng.normal(size=8) * np.array([1, 1, 1, 1, 1, 1, 0, 0])
+        P[8:11, 8:11] = 0.01**2 * np.eye(3)
+        true = x + np.linalg.cholesky(P) @ rng.normal(size=11) * np.array([1, 1, 1, 1, 1, 1, 0, 0, 1, 1, 1])
         ukf = UnscentedFilter(state_at_rest(anchor, config)[0], P)
         for k in range(90):
             if k:
@@ -78,9 +80,11 @@ def test_sway_is_predicted_with_true_covariances_and_its_frequency_is_found() ->
             if k > 10:
                 nis.append(seen.nis)
         hz.append(abs(ukf.x[7] - true[7]))
+        away.append(float(np.linalg.norm(ukf.x[8:11] - true[8:11])))
     band = mean_band(3, len(nis), 0.999)
     assert band.low * 0.93 < np.mean(nis) < band.high * 1.07
     assert np.median(hz) < 0.1
+    assert np.median(away) < 0.003  # of 16 mm
 
 
 @given(seed=st.integers(0, 2**32 - 1), scale=st.floats(-9, 3))

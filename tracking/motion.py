@@ -1,8 +1,9 @@
 """How a group of points that hangs on something moves: at rest, swaying, or growing away. States and their noise.
 
-The state is ``[c (3), v (3), g, w]``: where the centroid is (m), its velocity (m/s), the logarithm of the group's scale
-relative to its rest shape, and the logarithm of the angular frequency (rad/s) at which it sways. All functions take
-stacks of states (..., 8). The place at rest (``anchor``, (3,) m) is not part of the state: a map knows it.
+The state is ``[c (3), v (3), g, w, e (3)]``: where the centroid is (m), its velocity (m/s), the log of the group's
+scale relative to its rest shape, the logarithm of the angular frequency (rad/s) at which it sways, and how far (m) the
+place about which it sways is from ``anchor`` (3,): a map says where it hangs, but what it learned of a group that it
+has seen little of, and swinging, may be centimetres off. All functions take stacks of states (..., 11).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from tracking.gaussian import Array
 
-N_STATES = 8
+N_STATES = 11
 
 
 class MotionKind(Enum):
@@ -43,26 +44,28 @@ class MotionConfig:
 
 
 def advance(x: Array, dt: float, anchor: Array, kind: MotionKind, config: MotionConfig) -> Array:
-    """States (..., 8) after ``dt`` seconds, without noise.
+    """States (..., 11) after ``dt`` seconds, without noise.
 
-    Sway is the exact solution of the damped oscillator d'' = -w0^2 d - 2 zeta w0 d' about the anchor; rest forgets its
-    displacement within ``tremble_s``; growth goes straight on.
+    Sway is the exact solution of the damped oscillator d'' = -w0^2 d - 2 zeta w0 d' about anchor + e; rest forgets its
+    displacement from the anchor within ``tremble_s``; growth goes straight on.
     """
     out = x.copy()
     if kind is MotionKind.GROWTH:
         out[..., :3] += x[..., 3:6] * dt
         return out
-    d, v = x[..., :3] - anchor, x[..., 3:6]
+    v = x[..., 3:6]
     if kind is MotionKind.REST:
-        out[..., :3] = anchor + d * np.exp(-dt / config.tremble_s)
+        out[..., :3] = anchor + (x[..., :3] - anchor) * np.exp(-dt / config.tremble_s)
         out[..., 3:6] = 0.0
         return out
+    about = anchor + x[..., 8:11]
+    d = x[..., :3] - about
     omega = np.exp(np.clip(x[..., 7:8], -3.0, 5.0))
     zeta = config.damping
     damped = omega * np.sqrt(1.0 - zeta * zeta)
     decay, sin, cos = np.exp(-zeta * omega * dt), np.sin(damped * dt), np.cos(damped * dt)
     lean = zeta * omega / damped * sin
-    out[..., :3] = anchor + decay * ((cos + lean) * d + sin / damped * v)
+    out[..., :3] = about + decay * ((cos + lean) * d + sin / damped * v)
     out[..., 3:6] = decay * ((cos - lean) * v - omega * omega / damped * sin * d)
     return out
 
@@ -70,7 +73,7 @@ def advance(x: Array, dt: float, anchor: Array, kind: MotionKind, config: Motion
 def process_noise(
     x: Array, dt: float, anchor: Array, kind: MotionKind, config: MotionConfig, unrest: float = 1.0
 ) -> Array:
-    """Covariance (8, 8) of what ``advance`` does not know, for one state (8,).
+    """Covariance (11, 11) of what ``advance`` does not know, for one state (11,).
 
     ``unrest``: how many times larger than usual the unknown accelerations of sway have proved to be.
     """
@@ -106,16 +109,16 @@ def touch_noise(dt: float, config: MotionConfig) -> Array:
 
 
 def amplitude(x: Array, anchor: Array) -> float:
-    """How far (m) a state (8,) will swing: sqrt(|d|^2 + |v|^2 / w^2)."""
-    d, v, omega = x[:3] - anchor, x[3:6], np.exp(x[7])
+    """How far (m) a state (11,) will swing: sqrt(|d|^2 + |v|^2 / w^2)."""
+    d, v, omega = x[:3] - anchor - x[8:11], x[3:6], np.exp(x[7])
     return float(np.sqrt(d @ d + (v @ v) / (omega * omega)))
 
 
 def state_at_rest(anchor: Array, config: MotionConfig) -> tuple[Array, Array]:
-    """State (8,) and covariance (8, 8) of a group of which nothing is known but that it hangs at ``anchor``."""
+    """State (11,) and covariance (11, 11) of a group of which nothing is known but that it hangs at ``anchor``."""
     x = np.zeros(N_STATES)
     x[:3] = anchor
     x[7] = np.log(2.0 * np.pi * config.sway_hz)
     speed = config.tremble_m / config.tremble_s
-    sigma = [config.tremble_m] * 3 + [speed] * 3 + [0.02, config.sway_log_sigma]
+    sigma = [config.tremble_m] * 3 + [speed] * 3 + [0.02, config.sway_log_sigma] + [config.tremble_m] * 3
     return x, np.diag(np.square(sigma))

@@ -29,6 +29,9 @@ _LEAN_S = 5.0  # over which the mean displacement at rest is taken
 _LEANING = 4.0  # times the trembling
 _UNSEEN_M = 0.002  # a cluster that is not looked at may have been moved so far, one sigma ...
 _UNSEEN_S = 5.0  # ... after so long
+_SWUNG_M = 0.015  # how far from rest is taken for rest of what was first seen in a swing, one sigma an axis ...
+_SHAPE = 3  # flowers that cannot be taken for others
+_SETTLED_S = 0.3  # ... until it has been seen to hang still for so long
 _LEARN = 0.1  # how quickly the unrest follows the innovations ...
 _MOST_UNREST = 10.0  # ... and how far
 
@@ -48,25 +51,27 @@ class ClusterTrack:
         self.kind, self.why = MotionKind.REST, "new"
         self.log_odds = -_SURE  # of sway against rest
         self.anchor: Array | None = None
+        self.n_flowers = 0
         self.anchor_cov: Array = 1e-6 * np.eye(3)
         self.filter: UnscentedFilter | None = None
         self.trembling: tuple[Array, Array] | None = None  # at rest: displacement and covariance when last seen
         self.unrest = 1.0  # times that accelerations are larger than usual, by the innovations
         self.last_nis = float("nan")
         self.last_shape = -np.inf
+        self.rested_s = 0.0  # how long it has been seen at rest
         self.lean, self.lean_s = np.zeros(3), 0.0  # mean displacement while at rest, and over how long
 
     @property
     def is_moving(self) -> bool:
         return self.kind is not MotionKind.REST and self.filter is not None
 
-    def place(self, anchor: Array) -> None:
-        """The map has moved the centroid at rest: the displacement stays what it was."""
+    def place(self, anchor: Array, n_flowers: int) -> None:
+        """The map has moved the centroid at rest of so many flowers: the displacement stays what it was."""
         if self.anchor is not None and self.filter is not None:
             x = self.filter.x.copy()
             x[:3] += anchor - self.anchor
             self.filter.reset(x, self.filter.P)
-        self.anchor = anchor
+        self.anchor, self.n_flowers = anchor, n_flowers
 
     def awaken(self, stamp: float) -> None:
         """Begin to follow it (it has been confirmed)."""
@@ -92,10 +97,11 @@ class ClusterTrack:
 
     @property
     def reach(self) -> float:
-        """How far from rest it swings at present, m."""
+        """How far from rest it swings at present, m, and how far rest may be from where it is taken to be."""
         if not self.is_moving or self.filter is None or self.anchor is None:
             return self.config.tremble_m
-        return max(amplitude(self.filter.x, self.anchor), self.config.tremble_m)
+        unknown = float(np.trace(self.filter.P[8:11, 8:11]))
+        return max(float(np.hypot(amplitude(self.filter.x, self.anchor), np.sqrt(unknown))), self.config.tremble_m)
 
     def now(self, stamp: float) -> tuple[Array, Array, Array]:
         """Centroid (3,), velocity (3,), and their covariance (6, 6), the map's own with it; predicted if not seen."""
@@ -139,7 +145,7 @@ class ClusterTrack:
         f.reset(x, P)
 
     def _far(self, f: UnscentedFilter, anchor: Array, dt: float) -> tuple[Array, Array, float]:
-        """State (8,) and covariance (8, 8) after a long time: no phase of a sway is known; how far it still swings."""
+        """State (11,) and covariance after a long time: no phase of a sway is known; how far it still swings."""
         x, P = state_at_rest(anchor, self.config)
         omega = np.exp(f.x[7])
         left = self.reach * np.exp(-self.config.damping * omega * dt) if self.is_moving else 0.0
@@ -149,6 +155,10 @@ class ClusterTrack:
         P[6, 6] = f.P[6, 6] + self.config.scale_walk**2 * dt
         P[7, 7] = min(f.P[7, 7] + self.config.frequency_walk**2 * dt, self.config.sway_log_sigma**2)
         x[6:] = f.x[6:]
+        x[:3] += x[8:11]
+        P[8:11, 8:11] = f.P[8:11, 8:11]
+        P[:3, :3] += P[8:11, 8:11]
+        P[:3, 8:11] = P[8:11, :3] = P[8:11, 8:11]
         return x, P, float(left)
 
     def weigh(self, at_rest: float, waking: float, shift: Array, cov: Array, dt: float) -> None:
@@ -171,22 +181,31 @@ class ClusterTrack:
         p = p * (1.0 - _CALMED) + (1.0 - p) * _TOUCHED
         self.log_odds = float(np.log(p / (1.0 - p))) + min(max(moving - at_rest, -_MOST), _MOST)
         if not self.is_moving and self.log_odds > _SURE:
-            x, P = state_at_rest(self.anchor, self.config)
-            x[6:], P[6, 6], P[7, 7] = f.x[6:], f.P[6, 6], f.P[7, 7]
-            f.reset(x, P)
+            f.reset(*self._hanging(f, self.anchor))
             self._switch(MotionKind.SWAY, f"it stands {1e3 * float(np.linalg.norm(shift)):.1f} mm from rest")
             self._loosen(f, _NOTICED * dt)
         elif self.is_moving and self.log_odds < -_SURE:
             self._switch(MotionKind.REST, "it has come to rest")
-            x, P = state_at_rest(self.anchor, self.config)
-            x[6:], P[6, 6], P[7, 7] = f.x[6:], f.P[6, 6], f.P[7, 7]
-            f.reset(x, P)
+            f.reset(*self._hanging(f, self.anchor))
         elif is_pushed:
             self.why = "it was pushed again"
             self._loosen(f, dt)
         elif self.is_moving:
             surprise = min(self.last_nis / 3.0 - 1.0, 2.0)
             self.unrest = float(np.clip(self.unrest * np.exp(_LEARN * surprise), 1.0, _MOST_UNREST))
+
+    def _hanging(self, f: UnscentedFilter, anchor: Array) -> tuple[Array, Array]:
+        """State (11,) and covariance (11, 11) at rest, with the scale and the frequency that are known by now.
+
+        The place at rest is as well known as the map says, if it has been seen at rest for a while: what was only seen
+        in a swing may hang centimetres from there. Of fewer flowers than make a shape this is not believed: that they
+        were taken for others is likelier.
+        """
+        x, P = state_at_rest(anchor, self.config)
+        x[6:8], P[6, 6], P[7, 7] = f.x[6:8], f.P[6, 6], f.P[7, 7]
+        if self.n_flowers >= _SHAPE:
+            P[8:11, 8:11] += self.anchor_cov + _SWUNG_M**2 * np.exp(-self.rested_s / _SETTLED_S) * _EYE
+        return x, P
 
     def _loosen(self, f: UnscentedFilter, dt: float) -> None:
         """Something touched it within the last ``dt`` seconds."""
@@ -197,6 +216,7 @@ class ClusterTrack:
     def rest(self, u: Array, dt: float, stamp: float) -> None:
         """At rest it was seen displaced by u (3,): one that leans away for long, and not by trembling, is growing."""
         weight = min(dt, _LONG_S) / _LEAN_S
+        self.rested_s += min(dt, _LONG_S)
         self.lean, self.lean_s = self.lean + weight * (u - self.lean), self.lean_s + dt
         distance = float(np.linalg.norm(self.lean))
         f = self.filter
@@ -207,9 +227,9 @@ class ClusterTrack:
             or distance < _LEANING * self.config.tremble_m
         ):
             return
-        x, P = state_at_rest(self.anchor + self.lean, self.config)
+        x, P = self._hanging(f, self.anchor)
+        x[:3] += self.lean
         x[3:6] = self.lean / self.lean_s
-        x[6:], P[6, 6], P[7, 7] = f.x[6:], f.P[6, 6], f.P[7, 7]
         P[3:6, 3:6] = (distance / self.lean_s) ** 2 * np.eye(3)
         f.reset(x, P)
         self.stamp, self.lean_s = stamp, 0.0
@@ -247,13 +267,14 @@ class ClusterTrack:
         f = self.filter
         if f is None or self.anchor is None:
             return
-        x, P = state_at_rest(self.anchor, self.config)
+        x, P = self._hanging(f, self.anchor)
+        if self.is_moving:
+            x[8:11], P[8:11, 8:11] = f.x[8:11], f.P[8:11, 8:11]
         x[:3] += d
         if velocity is not None:
             x[3:6] = velocity
         P[:3, :3] = cov
         P[3:6, 3:6] = speed**2 * np.eye(3)
-        x[6], P[6, 6] = f.x[6], f.P[6, 6]
         f.reset(x, P)
         self.stamp = stamp
         self._switch(MotionKind.SWAY, reason)
