@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from map_help import SMALL as SMALL_SEASON
+from map_help import map_of
 
+from cluster_slam.constellation import growth
 from cluster_slam.evaluation.localised import pose_nees
-from cluster_slam.localisation.landmarks import landmarks
+from cluster_slam.geometry import adjoint, inverse, se3_exp, skew
+from cluster_slam.localisation.landmarks import landmarks, landmarks_at
 from cluster_slam.localisation.shifts import shift_of
 from cluster_slam.pipeline.localise import localise
 from cluster_slam.records import CLUTTER
 from cluster_slam.simulate import simulate_session
 from cluster_slam.simulate.config import MODERATE
+from cluster_slam.simulate.season import SeasonPlant
 
 DRIFT_M, OWN_M = 0.009, 0.0015  # one sigma an axis: five days at 3 mm a day
 SMALL = 1e-6 * np.eye(3)
@@ -62,3 +68,27 @@ def test_no_point_near_says_nothing() -> None:
     found = shift_of(np.ones((2, 3)), SMALL, np.zeros((2, 3)), SMALL, SMALL, 1e4)
     np.testing.assert_array_equal(found.mean, 0.0)
     np.testing.assert_array_equal(found.cov, SMALL)
+
+
+def test_what_all_clusters_drift_in_common_is_in_the_pose(tmp_path: Path) -> None:
+    """A map that knows its clusters well by now has still been aligned with where it expected them, each time."""
+    with map_of(tmp_path, SeasonPlant(SMALL_SEASON, seed=3)) as store:
+        plant = store.plants()[0]
+    later = float(np.nanmin(plant.cluster_first_seen)) + 5.0 * growth.DAY_S
+    assert not landmarks_at(plant, later).frame_cov.any()  # one session: what may have drifted is in its clusters
+    n = len(plant.cluster_ids)
+    known = replace(
+        plant,
+        cluster_time=np.full(n, later),
+        cluster_covs=np.tile(1e-10 * np.eye(3), (n, 1, 1)),
+        velocity_covs=np.zeros((n, 3, 3)),
+    )
+    marks = landmarks_at(known, later)
+    rng, sigma = np.random.default_rng(0), np.sqrt(growth.drifted(plant, 5.0 * growth.DAY_S, 60.0))
+    J = np.concatenate([-skew(marks.centres), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=-1).reshape(-1, 6)
+    common = np.linalg.lstsq(J, sigma * rng.normal(size=(3 * n, 4000)), rcond=None)[0]
+    scale = np.sqrt(np.diag(np.cov(common)))
+    np.testing.assert_allclose(marks.frame_cov / np.outer(scale, scale), np.corrcoef(common), atol=0.08)
+    T = se3_exp(np.array([0.3, -0.2, 0.1, 0.5, 0.2, -0.4]))
+    by_pose = adjoint(inverse(T)) @ common  # as errors of a pose, tangent on the right
+    np.testing.assert_allclose(np.diag(marks.in_first_frame(np.zeros((6, 6)), T)), by_pose.var(axis=1), rtol=0.08)

@@ -100,3 +100,10 @@ def gaps(plant: PlantMap, time: float) -> Array:
     """Seconds (c,) from each cluster's state to ``time``; 0 where one of the two is unknown."""
     gap: Array = np.nan_to_num(time - plant.cluster_time, nan=0.0)
     return gap
+
+
+def drifted(plant: PlantMap, seconds: float, memory_days: float) -> float:
+    """Variance along each axis of a cluster's drift over a time (0 where it is not known)."""
+    days = abs(float(np.nan_to_num(seconds))) / DAY_S
+    steady = 2.0 * memory_days * (days + memory_days * np.expm1(-days / memory_days))  # of a velocity of variance 1
+    return float(plant.drift_rate**2 / 3.0 * steady + plant.walk_rate**2 * days)

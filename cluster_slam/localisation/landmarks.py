@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
+from cluster_slam.config import GrowthConfig
 from cluster_slam.constellation import growth
 from cluster_slam.errors import InputError
-from cluster_slam.geometry import Array
+from cluster_slam.geometry import Array, adjoint, inverse, skew
 from cluster_slam.records import BoolArray, IntArray, PlantMap
 
 _GONE_BELOW = 0.1  # presence
@@ -21,7 +22,8 @@ class Landmarks:
     """Flowers of one plant in the plant's own frame of the map.
 
     ``covs`` is of each flower about its cluster, ``shared_covs`` of the error that all flowers of a cluster share: how
-    well its place is known now, with what it may have drifted since it was last seen.
+    well its place is known now, with what it may have drifted since it was last seen. ``frame_cov`` is of what no
+    session could see: what all of them drifted in common since the map's first.
     """
 
     plant: str
@@ -30,6 +32,7 @@ class Landmarks:
     positions: Array  # (f, 3) map, m
     covs: Array  # (f, 3, 3) m^2
     shared_covs: Array  # (c, 3, 3) m^2, in the order of the increasing cluster ids
+    frame_cov: Array = field(default_factory=lambda: np.zeros((6, 6)))  # of all landmarks as one, tangent on the left
 
     def __len__(self) -> int:
         return len(self.flower_ids)
@@ -45,6 +48,11 @@ class Landmarks:
         count = np.bincount(self.cluster, minlength=self.n_clusters)
         sums = np.stack([np.bincount(self.cluster, x, self.n_clusters) for x in self.positions.T], axis=1)
         return np.asarray(sums / count[:, None])
+
+    def in_first_frame(self, cov: Array, T_map_camera: Array) -> Array:
+        """A pose's covariance (6, 6) in this map as it is in the frame of the map's first session."""
+        J = adjoint(inverse(T_map_camera))
+        return np.asarray(cov + J @ self.frame_cov @ J.T)
 
     @property
     def n_clusters(self) -> int:
@@ -111,7 +119,7 @@ def landmarks_at(plant: PlantMap, time: float) -> Landmarks:
     if not there.any():
         raise InputError(f"the map of plant {plant.name!r} is empty, expected flowers to localise by")
     clusters = np.unique(then.flower_cluster_ids[there])
-    return landmarks(
+    marks = landmarks(
         then.flowers[there],
         then.flower_cluster_ids[there],
         flower_ids=then.flower_ids[there],
@@ -119,3 +127,21 @@ def landmarks_at(plant: PlantMap, time: float) -> Landmarks:
         shared_covs=then.cluster_covs[np.searchsorted(then.cluster_ids, clusters)],
         plant=plant.name,
     )
+    return replace(marks, frame_cov=_common_drift(marks, then, time))
+
+
+def _common_drift(marks: Landmarks, plant: PlantMap, time: float) -> Array:
+    """Covariance (6, 6) of how far all clusters have drifted as one since the map's first session.
+
+    Later sessions were aligned with where clusters were expected, so what these drifted in common stayed unseen, and
+    their learned velocities lack it. It is that of the layout, were each cluster free to drift so far by itself.
+    """
+    seconds = time - np.nanmin(plant.cluster_first_seen) if np.isfinite(plant.cluster_first_seen).any() else 0.0
+    var = growth.drifted(plant, seconds, GrowthConfig().memory_days)
+    unseen = var - float(np.median(np.trace(marks.shared_covs, axis1=1, axis2=2))) / 3.0
+    if unseen <= 0.0 or marks.n_clusters < 3:
+        return np.zeros((6, 6))
+    J = np.concatenate([-skew(marks.centres), np.broadcast_to(np.eye(3), (marks.n_clusters, 3, 3))], axis=-1)
+    information = np.einsum("cia,cib->ab", J, J) / unseen
+    least = 1e-6 * float(np.trace(information)) * np.eye(6)  # clusters in a line do not turn about it
+    return np.asarray(np.linalg.solve(information + least, np.eye(6)))

@@ -38,6 +38,7 @@ class Localisation:
     plant: str  # of the best hypothesis, "" where there is none
     flower_ids: IntArray  # (n,) of the map, -1 none; the best hypothesis'
     cluster_ids: IntArray  # (n,)
+    marks: Landmarks | None = None  # of the plant of the best hypothesis
 
     @property
     def is_located(self) -> bool:
@@ -50,8 +51,9 @@ class Localisation:
 
     @property
     def cov(self) -> Array:
-        """Its covariance (6, 6), tangent on the right."""
-        return self.hypotheses[0].fit.cov
+        """Its covariance (6, 6), tangent on the right, in the frame of the map's first session."""
+        cov = self.hypotheses[0].fit.cov
+        return cov if self.marks is None else self.marks.in_first_frame(cov, self.T_map_camera)
 
     @property
     def probability(self) -> float:
@@ -199,7 +201,7 @@ class Localiser:
         marks = self.plants[best.plant]
         flowers[best.fit.rows] = marks.flower_ids[best.fit.flowers]
         clusters[best.fit.rows] = marks.cluster_ids[best.fit.flowers]
-        return Localisation(self._reason(found), tuple(found), marks.plant, flowers, clusters)
+        return Localisation(self._reason(found), tuple(found), marks.plant, flowers, clusters, marks)
 
     def _reason(self, found: list[Hypothesis]) -> LostReason:
         config, best = self.config, found[0]

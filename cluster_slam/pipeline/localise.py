@@ -283,9 +283,10 @@ def _session_localisation(
     n, rows = session.n_frames, frames.rows
     T, covs = np.full((n, 4, 4), np.nan), np.full((n, 6, 6), np.nan)
     flowers, clusters = (np.full(len(session.observations), CLUTTER) for _ in range(2))
+    marks = {p.plant: p for p in frames.localiser.plants}
     for i, place in enumerate(places):
         if place.reason == "" and place.T_map_camera is not None and place.cov is not None:
-            T[i], covs[i] = place.T_map_camera, place.cov
+            T[i], covs[i] = place.T_map_camera, marks[place.plant].in_first_frame(place.cov, place.T_map_camera)
             flowers[rows[i]], clusters[rows[i]] = place.flower_ids, place.cluster_ids
     warnings = () if any(p.reason == "" for p in places) else ("no frame was located",)
     return SessionLocalisation(

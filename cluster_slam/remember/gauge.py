@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from cluster_slam.constellation.fit import Pairs, pose_covariance
-from cluster_slam.constellation.growth import DAY_S
+from cluster_slam.constellation.growth import drifted
 from cluster_slam.geometry import Array
 from cluster_slam.io.map.store import StoredSession
 from cluster_slam.records import PlantMap
@@ -47,17 +47,10 @@ def frame_covariance(
         Variance of the drift over what was expected, as this session has it: while nothing else has been learned of it.
     """
     begin = sessions[0].start
-    since = _drifted(plant, now - begin, memory_days)
-    first_gap = since if len(sessions) < 2 else _drifted(plant, sessions[1].start - begin, memory_days)
+    since = drifted(plant, now - begin, memory_days)
+    first_gap = since if len(sessions) < 2 else drifted(plant, sessions[1].start - begin, memory_days)
     since *= drift_factor if len(sessions) < 2 else 1.0
     grown = max(since / first_gap, 1.0) if first_gap > 0.0 else 1.0
     common = since * min(pairs.n_units / max(int((plant.cluster_presence > 0.5).sum()), 1), 1.0)
     pairs = replace(pairs, var_offset=np.maximum(pairs.var_offset, common), variance=pairs.variance * grown)
     return pose_covariance(pairs, scale, with_scale=with_scale)
-
-
-def _drifted(plant: PlantMap, seconds: float, memory_days: float) -> float:
-    """Variance along each axis of a cluster's drift over a time (0 where it is not known)."""
-    days = abs(float(np.nan_to_num(seconds))) / DAY_S
-    steady = 2.0 * memory_days * (days + memory_days * np.expm1(-days / memory_days))  # of a velocity of variance 1
-    return float(plant.drift_rate**2 / 3.0 * steady + plant.walk_rate**2 * days)
