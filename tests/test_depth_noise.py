@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cluster_slam.association.depth_noise import at_expected_depth, powers_of_depth
+from cluster_slam.association.depth_noise import DepthSums, at_expected_depth, powers_of_depth
 from cluster_slam.association.frames import Frames, sort_by_frame
 from cluster_slam.geometry import Array
 from cluster_slam.records import Observations
@@ -59,3 +59,11 @@ def test_what_is_not_known_stays_as_it_is() -> None:
     np.testing.assert_array_equal(found.covs[:100], frames.covs[:100])
     np.testing.assert_allclose(found.covs[100:, 2, 2], 0.05**2, rtol=1e-9)
     np.testing.assert_allclose(found.covs[100:, 0, 0], 0.002**2, rtol=1e-9)
+
+
+def test_powers_of_frames_one_by_one_are_those_of_all() -> None:
+    frames, _ = _seen(np.linspace(0.5, 2.0, 200), 2.0)
+    sums = DepthSums()
+    for k in range(0, 200, 7):
+        sums.add(frames.points[k : k + 7], frames.covs[k : k + 7])
+    assert sums.powers() == pytest.approx(powers_of_depth(frames), abs=1e-9)

@@ -75,17 +75,40 @@ def stretched(points: Array, covs: Array, depth: Array, powers: tuple[float, flo
 
 def powers_of_depth(frames: Frames) -> tuple[float, float]:
     """Powers of depth with which the stated sigma grows along the ray and across it; zeros where nothing tells."""
-    z = frames.points[:, 2]
-    ahead = z > 0
-    if ahead.sum() < _FEWEST or np.log(z[ahead]).std() < _LEAST_SPREAD:
-        return 0.0, 0.0
-    points, covs = frames.points[ahead], frames.covs[ahead]
-    u = points / np.linalg.norm(points, axis=1)[:, None]
-    along = np.einsum("mi,mij,mj->m", u, covs, u)
-    across = 0.5 * (np.trace(covs, axis1=1, axis2=2) - along)
-    x = np.log(z[ahead]) - np.log(z[ahead]).mean()
-    slopes = [float(x @ np.log(np.sqrt(var)) / (x @ x)) for var in (along, across)]
-    return float(np.clip(slopes[0], 0.0, _STEEPEST)), float(np.clip(slopes[1], 0.0, _STEEPEST))
+    sums = DepthSums()
+    sums.add(frames.points, frames.covs)
+    return sums.powers()
+
+
+class DepthSums:
+    """Sums over observations that tell how the logarithms of the stated sigmas grow with that of depth."""
+
+    def __init__(self) -> None:
+        self._n, self._of_x = 0, np.zeros(2)
+        self._of_y, self._of_xy = np.zeros(2), np.zeros(2)  # along the ray, across it
+
+    def add(self, points: Array, covs: Array) -> None:
+        """Points (q, 3) of the camera frame with stated covariances (q, 3, 3)."""
+        ahead = points[:, 2] > 0
+        points, covs = points[ahead], covs[ahead]
+        u = points / np.linalg.norm(points, axis=1)[:, None]
+        along = np.einsum("mi,mij,mj->m", u, covs, u)
+        across = 0.5 * (np.trace(covs, axis1=1, axis2=2) - along)
+        x, y = np.log(points[:, 2]), 0.5 * np.log(np.stack([along, across]))
+        self._n += len(x)
+        self._of_x += x.sum(), x @ x
+        self._of_y += y.sum(axis=1)
+        self._of_xy += y @ x
+
+    def powers(self) -> tuple[float, float]:
+        """Along the ray and across it; zeros where nothing tells."""
+        n = max(self._n, 1)
+        mean, square = self._of_x / n
+        var = square - mean * mean
+        if self._n < _FEWEST or var < _LEAST_SPREAD**2:
+            return 0.0, 0.0
+        along, across = np.clip((self._of_xy / n - mean * self._of_y / n) / var, 0.0, _STEEPEST)
+        return float(along), float(across)
 
 
 def _squares(v: Array) -> Array:

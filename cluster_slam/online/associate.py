@@ -48,8 +48,11 @@ class Seen:
     at: Snapshot
 
 
-def associate(world: World, view: View, cov_hand_eye: Array) -> Seen:
-    """Match, find the pose, match again, search for what was touched, and find the pose of all that."""
+def associate(world: World, view: View, cov_hand_eye: Array) -> tuple[Seen, View]:
+    """Match, find the pose, match again, search for what was touched, and find the pose of all that.
+
+    Returns what was seen, and the view with the noise that its points have at the depth of what they show.
+    """
     table, config = world.flowers, world.config
     predict_moving(world, view)
     rows = np.flatnonzero(table.confirmed)
@@ -63,14 +66,14 @@ def associate(world: World, view: View, cov_hand_eye: Array) -> Seen:
     P = at.P[table.slot[rows]] + place_cov
     found = match(predicted, P, w, view.S + J @ cov_z @ np.swapaxes(J, 1, 2), config.gate_chi2)
 
-    def pose_of(m: Matches, n_iterations: int = 3) -> PoseSolution:
+    def pose_of(m: Matches, S: Array, n_iterations: int = 3) -> PoseSolution:
         if not len(m.rows):
             return no_pose(cov_z)
-        W = information(view.S[m.cols] + place_cov[m.rows])
+        W = information(S[m.cols] + place_cov[m.rows])
         slot = table.slot[rows[m.rows]]
         return solve_pose(J[m.cols], predicted[m.rows] - w[m.cols], W, slot, at.P, prior, n_iterations=n_iterations)
 
-    pose = pose_of(found, 2)
+    pose = pose_of(found, view.S, 2)
     moved = transform(view.T @ se3_exp(pose.z), view.c)
     found = match(predicted, P, moved, view.S + J @ pose.cov @ np.swapaxes(J, 1, 2), config.gate_chi2)
     better = search(world, view, rows, found, predicted, moved, at)
@@ -81,7 +84,10 @@ def associate(world: World, view: View, cov_hand_eye: Array) -> Seen:
     if better is not None:
         found, at = better, world.snapshot(view.stamp)
         predicted = world.expected(rows, at)
-    return Seen(rows[found.rows], found.cols, found.chi2, pose_of(found), at)
+    S = view.S.copy()
+    k = found.cols
+    S[k] = world.noise_at(view.T @ se3_exp(pose.z), predicted[found.rows], view.c[k], S[k])
+    return Seen(rows[found.rows], k, found.chi2, pose_of(found, S), at), replace(view, S=S)
 
 
 def predict_moving(world: World, view: View) -> None:

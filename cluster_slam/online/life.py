@@ -90,7 +90,7 @@ def match_tentative(world: World, seen: Seen, view: View, T: Array, w: Array, ro
     rows, cols = tentative[m.rows], left[m.cols]
     row_of[cols] = rows
     P = table.cov[rows] + slack
-    gain = P @ information(P + view.S[cols])
+    gain = P @ information(P + world.noise_at(T, at[m.rows], view.c[cols], view.S[cols]))
     table.place[rows] += (gain @ (w[cols] - seen.at.d[table.slot[rows]] - table.place[rows])[..., None])[..., 0]
     P = P - gain @ P
     table.cov[rows] = 0.5 * (P + np.swapaxes(P, 1, 2))

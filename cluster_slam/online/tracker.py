@@ -84,7 +84,7 @@ class OnlineTracker:
         use = np.flatnonzero(taken.usable)
         view = self._view(frame, use, taken.stamp, dt)
         self.world.widen_view(view.c)
-        seen = associate(self.world, view, np.zeros((6, 6)) if self.world.map.is_frozen else self.cov_X)
+        seen, view = associate(self.world, view, np.zeros((6, 6)) if self.world.map.is_frozen else self.cov_X)
         T = view.T @ se3_exp(seen.pose.z)
         w = transform(T, view.c)
         follow(self.world, seen, w, view.S, taken.stamp)
@@ -121,6 +121,7 @@ class OnlineTracker:
         """The frame's usable points, with the camera's pose as it is known before they speak."""
         T, cov = self._predicted_pose(frame, dt)
         stated = 0.5 * (frame.covs[use] + np.swapaxes(frame.covs[use], 1, 2))
+        self.world.depth_sums.add(frame.points[use], stated)
         S = rotate_cov(T[:3, :3], self.noise_watch.factor * stated) + _LEAST_M**2 * np.eye(3)
         return View(T, cov, frame.points[use], S, stamp, self.n_frames)
 

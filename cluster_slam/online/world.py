@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cluster_slam.association.depth_noise import DepthSums, stretched
 from cluster_slam.config import OnlineConfig
-from cluster_slam.geometry import Array, inverse, transform
+from cluster_slam.geometry import Array, inverse, rotate_cov, transform
 from cluster_slam.graph.incremental import IncrementalMap
 from cluster_slam.online.births import Births
 from cluster_slam.online.cluster import ClusterTrack, unseen_var
@@ -48,6 +49,7 @@ class World:
         self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)  # of x / z, y / z and z of all points so far
         self.spacing = np.inf  # m, how close flowers stand
         self.births = Births()
+        self.depth_sums = DepthSums()  # how the stated noise grows with depth
         self.usual_dt = 1.0 / 30.0
         self.x = np.zeros(6)  # hand-eye tangent
         self.unclaimed = 1.0  # points a frame that no known flower claims, averaged
@@ -100,6 +102,19 @@ class World:
         if len(c):
             rays = np.column_stack([c[:, 0] / c[:, 2], c[:, 1] / c[:, 2], c[:, 2]])
             self.low, self.high = np.minimum(self.low, rays.min(0)), np.maximum(self.high, rays.max(0))
+
+    def noise_at(self, T: Array, expected: Array, c: Array, S: Array) -> Array:
+        """Covariances S (q, 3, 3), world, of points c (q, 3), camera frame, as stated at the depths of ``expected``.
+
+        Where a flower is expected (q, 3), world, is where its noise is right: at the depth that was measured, what
+        comes out too near seems to be surer.
+        """
+        powers = self.depth_sums.powers()
+        ahead = c[:, 2] > 0
+        if powers == (0.0, 0.0) or not ahead.all():
+            return S
+        R, depth = T[:3, :3], transform(inverse(T), expected)[:, 2]
+        return rotate_cov(R, stretched(c, rotate_cov(R.T, S), depth, powers))
 
     def in_view(self, T: Array, places: Array, slack: float) -> BoolArray:
         """Which places (k, 3) lie in the field of view, widened by ``slack`` (of x / z) on all sides."""
