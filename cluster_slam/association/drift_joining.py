@@ -32,9 +32,8 @@ from cluster_slam.association.submaps import (
 )
 from cluster_slam.geometry import Array
 
-_SAME = 0.98  # of the points have the same landmark: then two ways of joining are one ...
+_SAME = 0.98  # of the points have the same landmark: then two maps are one
 _FEW_MERGES = 5  # pairs of landmarks that are tried as one before ways are compared
-_ALIKE = 0.93  # ... and two wholes that have been associated again
 
 
 def assemble(session: DriftSession) -> list[State]:
@@ -86,10 +85,9 @@ def _joined(session: DriftSession, large: list[Part], small: list[Part]) -> list
     ways = [union.labels.settle(way.T, way.label, way.places, price, 2) for way in _ways(session, large, small)]
     span = (small[0].first - first, small[0].end - first)
     likely = _best(ways, config.n_wholes, 2.0 * config.lead)
-    again = [redo_once(union, way, span, price, _FEW_MERGES) for way in likely]
-    best = _best(again, config.n_wholes, config.lead, _ALIKE)
-    parted = [split(union.labels, union.labels.merge(way, price), price) for way in best]
-    return [as_part(union, way, first) for way in _best(parted, len(best))]
+    again = [union.labels.merge(redo_once(union, way, span, price, _FEW_MERGES), price) for way in likely]
+    parted = [split(union.labels, way, price) for way in again]
+    return [as_part(union, way, first) for way in _best(parted, config.n_wholes, config.lead)]
 
 
 def _ways(session: DriftSession, large: list[Part], small: list[Part]) -> list[Part]:
