@@ -16,25 +16,40 @@ from cluster_slam.records import IntArray
 
 
 def redo(session: DriftSession, state: State, price: float, n_merges: int = 12) -> State:
-    """Associate every stretch again, and part landmarks that are two, as long as that helps; landmarks have a price."""
+    """Associate every stretch again, and part landmarks that are two, as long as that helps; landmarks have a price.
+
+    After the first pass only where the pass before has changed something.
+    """
+    todo = spans(session, session.config.stretch_points)
     for _ in range(session.config.n_redo):
-        new = redo_once(session, state, (0, session.frames.n_frames), price, n_merges)
+        new, changed = _pass(session, state, todo, price, n_merges)
         new = split(session.labels, new, price)
         if new.cost >= state.cost - 1.0:
             break
         state = new
+        todo = [span for span in todo if any(span[0] < end and span[1] > first for first, end in changed)]
     return state
 
 
 def redo_once(session: DriftSession, state: State, within: tuple[int, int], price: float, n_merges: int = 12) -> State:
     """Associate the stretches that reach into the frames ``within`` (from, to) again; landmarks have a price."""
-    new = state
-    for first, end in spans(session, session.config.stretch_points):
-        if first < within[1] and end > within[0]:
-            new = _redo_span(session, new, (first, end), price)
-    if new is state:
-        return state
-    return session.labels.merge(session.labels.settle(new.T, new.label, new.places, price), price, n_merges)
+    todo = spans(session, session.config.stretch_points)
+    todo = [(first, end) for first, end in todo if first < within[1] and end > within[0]]
+    return _pass(session, state, todo, price, n_merges)[0]
+
+
+def _pass(
+    session: DriftSession, state: State, todo: list[tuple[int, int]], price: float, n_merges: int
+) -> tuple[State, list[tuple[int, int]]]:
+    """Associate spans again, one after the other; the state, merged, and the spans that have changed."""
+    new, changed = state, []
+    for span in todo:
+        before, new = new, _redo_span(session, new, span, price)
+        if new is not before:
+            changed.append(span)
+    if not changed:
+        return state, []
+    return session.labels.merge(session.labels.settle(new.T, new.label, new.places, price), price, n_merges), changed
 
 
 def spans(session: DriftSession, n_points: int) -> list[tuple[int, int]]:

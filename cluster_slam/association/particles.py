@@ -93,12 +93,15 @@ def trace_stretch(
     background = np.log((config.clutter_share + config.new_share) / view_cells(frames))
     d = steps.basis.shape[1]
     grid = (np.arange(n_particles) + 0.5) / n_particles
+    quantiles: dict[float, Array] = {}
     parents, paths, choices = [], [], []
     for i in range(first, end):
         mean, cov = particles.T, np.tile(1e-12 * np.eye(d), (n_particles, 1, 1))
         if i:
-            dof = steps.dof[i - 1]
-            factor = rng.permutation(dof / chi2.ppf(grid, dof))
+            dof = float(steps.dof[i - 1])
+            if dof not in quantiles:
+                quantiles[dof] = dof / chi2.ppf(grid, dof)
+            factor = rng.permutation(quantiles[dof])
             mean, cov = mean @ steps.motion[i - 1], steps.cov[i - 1] * factor[:, None, None]
         choices.append(_observe(particles, frames, i, mean, cov, steps.basis, background, config, rng))
         paths.append(particles.T)
