@@ -34,3 +34,11 @@ def test_a_touch_makes_it_likelier_that_neighbours_swing() -> None:
     calm, _ = sway.shares(np.array([doubtful, *[still] * 5]), covs, SCALE)
     shaken, _ = sway.shares(np.array([doubtful, *[[0.01, 0.01, 0.0]] * 5]), covs, SCALE)
     assert shaken[0, 0] < 0.5 * calm[0, 0]
+
+
+def test_what_a_frame_cannot_see_of_touches_is_the_mean_square_of_their_displacements() -> None:
+    rng = np.random.default_rng(0)
+    touched = rng.random(200_000) < SCALE.touched_share
+    size = SIZES[rng.integers(1, 4, 200_000)]
+    displacement = np.where(touched, size * rng.normal(size=200_000), 0.0)
+    assert sway.unseen_variance(SCALE) == pytest.approx(displacement.var(), rel=0.03)

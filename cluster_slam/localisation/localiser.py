@@ -38,7 +38,7 @@ class Localisation:
     plant: str  # of the best hypothesis, "" where there is none
     flower_ids: IntArray  # (n,) of the map, -1 none; the best hypothesis'
     cluster_ids: IntArray  # (n,)
-    marks: Landmarks | None = None  # of the plant of the best hypothesis
+    pose_cov: Array | None = None  # (6, 6) of the best hypothesis, with what all of the map may have drifted
 
     @property
     def is_located(self) -> bool:
@@ -52,8 +52,7 @@ class Localisation:
     @property
     def cov(self) -> Array:
         """Its covariance (6, 6), tangent on the right, in the frame of the map's first session."""
-        cov = self.hypotheses[0].fit.cov
-        return cov if self.marks is None else self.marks.in_first_frame(cov, self.T_map_camera)
+        return self.hypotheses[0].fit.cov if self.pose_cov is None else self.pose_cov
 
     @property
     def probability(self) -> float:
@@ -201,7 +200,8 @@ class Localiser:
         marks = self.plants[best.plant]
         flowers[best.fit.rows] = marks.flower_ids[best.fit.flowers]
         clusters[best.fit.rows] = marks.cluster_ids[best.fit.flowers]
-        return Localisation(self._reason(found), tuple(found), marks.plant, flowers, clusters, marks)
+        cov = marks.in_first_frame(best.fit.cov, best.fit.T_map_camera)
+        return Localisation(self._reason(found), tuple(found), marks.plant, flowers, clusters, cov)
 
     def _reason(self, found: list[Hypothesis]) -> LostReason:
         config, best = self.config, found[0]

@@ -53,3 +53,12 @@ def surprise(p: Array, prior: Array) -> float:
     """Divergence (nats) of the probabilities (c, k) from what they were: what it costs to say who swings."""
     ratio = np.log(np.maximum(p, 1e-300) / np.maximum(prior, 1e-300))
     return float((p * ratio).sum())
+
+
+def unseen_variance(scale: ErrorScale) -> float:
+    """Variance an axis, m^2, of a pose by touches that a single frame cannot see.
+
+    A touch moves neighbours the same way at first: where all that is in view was touched it looks like a camera that
+    moved. That is as likely as a cluster is touched, in a recording whose frames have shown how often that is.
+    """
+    return scale.touched_share * float(variances(scale)[1:].mean())

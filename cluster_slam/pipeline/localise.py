@@ -4,31 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
-from itertools import pairwise
 from time import perf_counter
 
 import numpy as np
 
-from cluster_slam.association.depth_noise import powers_of_depth
-from cluster_slam.association.frames import sort_by_frame
 from cluster_slam.config import LocaliseConfig
-from cluster_slam.geometry import Array, inverse, se3_exp, se3_log
-from cluster_slam.localisation import Landmarks, Localisation, Localiser
+from cluster_slam.geometry import inverse, se3_exp, se3_log
+from cluster_slam.localisation import Landmarks, Localiser
 from cluster_slam.localisation.following import Follower, Place
 from cluster_slam.localisation.instruments import put_right
-from cluster_slam.localisation.learning import Seen, learn_scale
-from cluster_slam.localisation.merging import merged_points
 from cluster_slam.localisation.motion import Motion, motion_of
 from cluster_slam.localisation.planar import Flat, flat_world
-from cluster_slam.localisation.scene import ErrorScale, Look, make_look
+from cluster_slam.localisation.scene import ErrorScale
 from cluster_slam.localisation.vehicle import FlatFollower
-from cluster_slam.records import CLUTTER, IntArray, PlantMap, PoseHypotheses, Session, SessionLocalisation
+from cluster_slam.pipeline.localise_frames import Frames
+from cluster_slam.records import CLUTTER, PlantMap, PoseHypotheses, Session, SessionLocalisation
 from tracking.gating import chi2_threshold
 
 Progress = Callable[[str, float], None]
-_N_LEARNING = 40  # frames from which the errors' scale is learnt, spread over the session
-_N_TOGETHER = 10  # frames that tell which plant of many is in view
-_N_POSE_LEARNING = 150  # frames in a row from which the given poses' errors are learnt
 
 
 def localise(
@@ -67,7 +60,7 @@ def localise(
     localiser = Localiser(
         _asked(session, plants), config, time=float(session.stamps[0]), point_sigma_m=_point_sigma(session)
     )
-    frames = _Frames(session, localiser)
+    frames = Frames(session, localiser)
     ready = perf_counter()
     say("learning how large the errors are", 0.02)
     motion = motion_of(session)
@@ -78,17 +71,33 @@ def localise(
         places = _on_floor(frames, flat, localiser.plants[0], seed, say)
     elif independent or window == 1:
         places = [frames.alone(i) for i in _told(session.n_frames, say)]
-    elif window is not None:
-        places = [_from_window(frames, motion, i, window) for i in _told(session.n_frames, say)]
     else:
-        frames.learn_poses(motion)
-        places = _followed(frames, motion, _told(session.n_frames, say))
-        if smooth:
-            backwards = _followed(frames, motion, range(session.n_frames - 1, -1, -1))[::-1]
-            fuse = _fused if motion.is_odometry else _surer
-            places = [fuse(a, b) for a, b in zip(places, backwards, strict=True)]
+        tracked = _tracked(frames, motion, window, smooth, say)
+        places = [_in_first_frame(p, localiser) for p in tracked]
     timings = {"map": ready - begin, "localising": perf_counter() - ready}
     return _session_localisation(session, frames, places, config, timings)
+
+
+def _tracked(frames: Frames, motion: Motion, window: int | None, smooth: bool, say: Progress) -> list[Place]:
+    """Frames with what others say of them: those of a window, all before, or all."""
+    n = frames.session.n_frames
+    if window is not None:
+        return [_followed(frames, motion, range(max(0, i - window + 1), i + 1))[-1] for i in _told(n, say)]
+    frames.learn_poses(motion)
+    places = _followed(frames, motion, _told(n, say))
+    if not smooth:
+        return places
+    backwards = _followed(frames, motion, range(n - 1, -1, -1))[::-1]
+    fuse = _fused if motion.is_odometry else _surer
+    return [fuse(a, b) for a, b in zip(places, backwards, strict=True)]
+
+
+def _in_first_frame(place: Place, localiser: Localiser) -> Place:
+    """The place with what all of the map may have drifted in common."""
+    if place.cov is None or place.T_map_camera is None:
+        return place
+    marks = next(p for p in localiser.plants if p.plant == place.plant)
+    return replace(place, cov=marks.in_first_frame(place.cov, place.T_map_camera))
 
 
 def _told(n: int, say: Progress) -> Iterator[int]:
@@ -98,102 +107,7 @@ def _told(n: int, say: Progress) -> Iterator[int]:
         yield i
 
 
-class _Frames:
-    """The frames of a session, ready to be looked at; what one frame alone says is found out once."""
-
-    def __init__(self, session: Session, localiser: Localiser) -> None:
-        self.session, self.localiser = session, localiser
-        self.rows = _rows_of_frames(session)
-        ordered = sort_by_frame(session.observations, session.stamps)
-        self.scale = replace(localiser.errors, depth_powers=powers_of_depth(ordered))
-        self.motion: Motion | None = None  # where frames may be taken together
-        self._found: dict[int, Localisation] = {}
-        self._plant: int | None = None  # that was seen last
-
-    def look(self, i: int, scale: ErrorScale | None = None) -> Look:
-        o, rows = self.session.observations, self.rows[i]
-        return make_look(o.points[rows], o.covs[rows], scale or self.scale)
-
-    def search(self, i: int) -> Localisation:
-        """The frame by itself, with no prior."""
-        if i not in self._found:
-            o, rows = self.session.observations, self.rows[i]
-            for among in self._plants(i):
-                found = self.localiser.locate_points(o.points[rows], o.covs[rows], scale=self.scale, among=among)
-                self._found[i] = found
-                if found.is_located:
-                    self._plant = found.hypotheses[0].plant
-                    break
-        return self._found[i]
-
-    def _plants(self, i: int) -> Iterator[Sequence[int] | None]:
-        """Plants among which a frame is looked for: all of a few; of many the last one, then those that it may show."""
-        if self.localiser.atlas is None:
-            yield None
-            return
-        if self._plant is not None:
-            yield [self._plant]
-        yield self.localiser.likely_plants(self._together(i))
-
-    def _together(self, i: int) -> Array:
-        """Points (n, 3) in the camera of frame i: its own, with those of the frames before where motion is known."""
-        if self.motion is None:
-            return self.look(i).points
-        motion, first = self.motion, max(0, i - _N_TOGETHER + 1)
-        steps = np.stack([motion.camera_step(i, k, motion.X0) for k in range(first, i + 1)])
-        return merged_points([self.look(k) for k in range(first, i + 1)], steps, self.scale.sway_m)
-
-    def learn(self) -> None:
-        """How large the errors are, from frames that are located for sure; twice, as gates follow from it."""
-        n = self.session.n_frames
-        chosen = np.unique(np.linspace(0, n - 1, min(n, _N_LEARNING)).round().astype(np.int64)).tolist()
-        for _ in range(2):
-            found = [(i, self.search(i)) for i in chosen]
-            sure = [(i, f) for i, f in found if f.is_located]
-            self._found = {}
-            if not sure:
-                return
-            seen = [
-                Seen(self.look(i), self.localiser.plants[f.hypotheses[0].plant], f.hypotheses[0].fit) for i, f in sure
-            ]
-            before = self.scale
-            self.scale = learn_scale(seen, self.scale)
-            chosen = [i for i, _ in sure]
-            if abs(np.log(self.scale.flower_variance / before.flower_variance)) < 0.3:
-                return
-
-    def learn_poses(self, motion: Motion) -> None:
-        """How large the errors of the given poses are, from a track through the first frames."""
-        n = min(self.session.n_frames, _N_POSE_LEARNING)
-        for _ in range(2):
-            follower = Follower(self.localiser, motion, self.scale, self.search, self.localiser.config.sway_time_s)
-            steps = [
-                place.step for i in range(n) if (place := follower.step(i, self.look(i))).reason == "" and place.step
-            ]
-            observed = sum(s.pose_error_sq for s in steps)
-            expected = sum(s.pose_error_sq_expected for s in steps)
-            ratio = float(np.clip((observed + 30.0) / (expected + 30.0), 0.1, 10.0))
-            self.scale = replace(self.scale, pose_variance=self.scale.pose_variance * ratio)
-            if abs(np.log(ratio)) < 0.2:
-                return
-
-    def alone(self, i: int) -> Place:
-        """Where one frame is, from itself alone."""
-        found = self.search(i)
-        best = found.hypotheses[0].fit if found.hypotheses else None
-        return Place(
-            found.reason,
-            found.plant,
-            found.probability,
-            None if best is None else best.T_map_camera,
-            None if best is None else best.cov,
-            found.flower_ids,
-            found.cluster_ids,
-            tuple((h.probability, h.fit.T_map_camera) for h in found.hypotheses),
-        )
-
-
-def _followed(frames: _Frames, motion: Motion, order: Iterable[int]) -> list[Place]:
+def _followed(frames: Frames, motion: Motion, order: Iterable[int]) -> list[Place]:
     """Frames one after the other: kidnapped first, then tracked."""
     follower = Follower(frames.localiser, motion, frames.scale, frames.search, frames.localiser.config.sway_time_s)
     return [follower.step(i, frames.look(i)) for i in order]
@@ -237,7 +151,7 @@ def _flat_world(session: Session, motion: Motion, localiser: Localiser) -> Flat 
     return flat_world(session, motion, localiser.plants[0]) if len(localiser.plants) == 1 else None
 
 
-def _on_floor(frames: _Frames, flat: Flat, marks: Landmarks, seed: int, say: Progress) -> list[Place]:
+def _on_floor(frames: Frames, flat: Flat, marks: Landmarks, seed: int, say: Progress) -> list[Place]:
     """Frames of a vehicle on a floor, one after the other."""
     say("finding what the instruments err by", 0.05)
     right = put_right(frames.session)
@@ -253,11 +167,6 @@ def _on_floor(frames: _Frames, flat: Flat, marks: Landmarks, seed: int, say: Pro
     return out
 
 
-def _from_window(frames: _Frames, motion: Motion, i: int, window: int) -> Place:
-    """Where a frame is, from the frames of a window that ends with it."""
-    return _followed(frames, motion, range(max(0, i - window + 1), i + 1))[-1]
-
-
 def _point_sigma(session: Session) -> float:
     covs = session.observations.covs
     return float(np.sqrt(np.trace(covs, axis1=1, axis2=2).mean() / 3.0)) if len(covs) else 0.005
@@ -269,24 +178,15 @@ def _asked(session: Session, plants: Sequence[PlantMap | Landmarks]) -> Sequence
     return named or plants
 
 
-def _rows_of_frames(session: Session) -> list[IntArray]:
-    """Rows of the observations of each frame, in their order."""
-    frame = session.observations.frame
-    order = np.argsort(frame, kind="stable")
-    ends = np.searchsorted(frame[order], np.arange(session.n_frames + 1))
-    return [order[a:b] for a, b in pairwise(ends.tolist())]
-
-
 def _session_localisation(
-    session: Session, frames: _Frames, places: list[Place], config: LocaliseConfig, timings: dict[str, float]
+    session: Session, frames: Frames, places: list[Place], config: LocaliseConfig, timings: dict[str, float]
 ) -> SessionLocalisation:
     n, rows = session.n_frames, frames.rows
     T, covs = np.full((n, 4, 4), np.nan), np.full((n, 6, 6), np.nan)
     flowers, clusters = (np.full(len(session.observations), CLUTTER) for _ in range(2))
-    marks = {p.plant: p for p in frames.localiser.plants}
     for i, place in enumerate(places):
         if place.reason == "" and place.T_map_camera is not None and place.cov is not None:
-            T[i], covs[i] = place.T_map_camera, marks[place.plant].in_first_frame(place.cov, place.T_map_camera)
+            T[i], covs[i] = place.T_map_camera, place.cov
             flowers[rows[i]], clusters[rows[i]] = place.flower_ids, place.cluster_ids
     warnings = () if any(p.reason == "" for p in places) else ("no frame was located",)
     return SessionLocalisation(

@@ -43,7 +43,7 @@ def _figures(found: Localisation, frame: Kidnapped) -> tuple[float, float, float
     known = found.flower_ids != CLUTTER
     right = float(np.mean(found.flower_ids[known] == frame.flowers[known])) if known.any() else 0.0
     xi = se3_log(inverse(found.T_map_camera) @ frame.T_map_camera)
-    nees = float(xi @ found.hypotheses[0].fit.information @ xi) if found.is_located else np.nan
+    nees = float(xi @ np.linalg.solve(found.cov, xi)) if found.is_located else np.nan
     near = bool(is_near(found.T_map_camera[None], frame.T_map_camera[None])[0])
     return float(found.is_located), right, nees, float(near)
 
