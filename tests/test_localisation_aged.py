@@ -14,7 +14,10 @@ from cluster_slam.constellation import growth
 from cluster_slam.evaluation.localised import pose_nees
 from cluster_slam.geometry import adjoint, inverse, se3_exp, skew
 from cluster_slam.localisation.landmarks import landmarks, landmarks_at
+from cluster_slam.localisation.motion import motion_of
+from cluster_slam.localisation.scene import ErrorScale, make_look
 from cluster_slam.localisation.shifts import shift_of
+from cluster_slam.localisation.tracking import start
 from cluster_slam.pipeline.localise import localise
 from cluster_slam.records import CLUTTER
 from cluster_slam.simulate import simulate_session
@@ -46,6 +49,46 @@ def test_poses_in_an_old_map_are_as_sure_as_is_said(seed: int) -> None:
     assert nees.mean() < 3.0  # one draw of six: 3 is exceeded by 0.6 % of them
     matched = found.flower_ids != CLUTTER
     assert (found.flower_ids == truth.flower_ids)[matched].mean() > 0.98
+
+
+def test_frames_do_not_tell_how_the_map_as_a_whole_is_off() -> None:
+    """However many frames, an old map stays as uncertain as the layout of its clusters leaves it.
+
+    A filter of displacements from the map falls to 0.89 of that in these sixty frames, and further in more, as each
+    is linearised about another orientation.
+    """
+    made = simulate_session(replace(MODERATE, duration_s=6.0, fps=10.0), seed=4)
+    session, of, drift_m = made.session, made.plant.flower_cluster, 0.024
+    drift = drift_m * np.random.default_rng(4).normal(size=(of.max() + 1, 3))
+    n = len(np.unique(of))
+    marks = landmarks(
+        made.plant.flowers - drift[of],
+        of,
+        covs=np.tile(0.003**2 * np.eye(3), (len(of), 1, 1)),
+        shared_covs=np.tile(drift_m**2 * np.eye(3), (n, 1, 1)),
+    )
+    scale = ErrorScale()
+    track = start(marks, motion_of(session), 0, made.truth.T_world_camera[0], scale, 0.3)
+    for k in range(session.n_frames):
+        rows = np.flatnonzero((session.observations.frame == k) & (made.truth.flower_ids >= 0))
+        if k:
+            track.predict(k)
+        if len(rows):
+            look = make_look(session.observations.points[rows], session.observations.covs[rows], scale)
+            track.update(look, np.arange(len(rows)), made.truth.flower_ids[rows], 1 if k else 4)
+    seen = track.state.cluster_at >= 0
+    J = np.concatenate([-skew(marks.centres[seen]), np.broadcast_to(np.eye(3), (seen.sum(), 3, 3))], axis=-1)
+    layout = np.einsum("cia,cib->ab", J, J) / drift_m**2
+    turns = np.zeros((6, 6))  # what the flowers of a cluster, of known shape, add on the orientation
+    for f in np.flatnonzero(seen[marks.cluster]):
+        arm = skew(marks.positions[f] - marks.centres[marks.cluster[f]])
+        turns[:3, :3] += arm.T @ arm / 0.003**2
+    W = track.state.W
+    stated = adjoint(W) @ track.state.P[6:12, 6:12] @ adjoint(W).T  # as a motion of the map
+    bound = np.linalg.inv(layout + turns)
+    ratio = np.sqrt(np.linalg.eigvals(np.linalg.solve(bound, stated)).real)
+    assert ratio.min() > 0.95
+    assert ratio.max() < 1.2
 
 
 def test_a_cluster_that_moved_by_the_distance_of_its_flowers_is_found() -> None:
