@@ -13,7 +13,7 @@ from cluster_slam.cli.progress import StageProgress
 from cluster_slam.cli.summary import print_json, print_table, print_warnings
 
 if TYPE_CHECKING:
-    from cluster_slam.pipeline.calibrate import CalibrationReport
+    from cluster_slam.pipeline.calibrate_report import CalibrationReport
 
 
 def command(

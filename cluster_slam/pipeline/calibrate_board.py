@@ -16,7 +16,8 @@ from cluster_slam.io.images import read_colour, read_image_list
 from cluster_slam.io.metadata import read_metadata
 from cluster_slam.io.session import stated_noise
 from cluster_slam.io.tables import TUM_POSE, read_tum
-from cluster_slam.pipeline.calibrate import CalibrationReport, calibrate_by_board
+from cluster_slam.pipeline.calibrate import calibrate_by_board
+from cluster_slam.pipeline.calibrate_report import CalibrationReport
 from cluster_slam.records import IntArray, Observations, Session
 from cluster_slam.sensors.camera import Camera
 
