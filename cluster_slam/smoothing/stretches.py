@@ -18,6 +18,7 @@ from scipy.ndimage import maximum_filter1d
 from cluster_slam.geometry import Array
 from cluster_slam.records import BoolArray, IntArray
 from cluster_slam.smoothing.displaced import FEWEST, Displaced, Series
+from cluster_slam.smoothing.glimpses import widened
 
 _LAGS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 21, 26, 34, 42, 55, 68, 89, 110, 144)
 _WITHIN = 0.8  # of a stretch's sigma: a quarter of a sine ends 0.9 of its own rms from its mean
@@ -106,7 +107,9 @@ def stretches(moved: Displaced, rest: float, lasting_s: float) -> tuple[IntArray
     wide = np.hypot(moved.scale[moving], rest)
     swing = _swings(moved, moving, wide, swing_keys, swing_of, _n_blocks(moved, quarter_s))
     sigma[moving] = np.maximum(wide, swing[swing_of])
-    return of, np.concatenate([np.full(len(calm_keys), rest), swing]), _WITHIN * sigma
+    sigma *= _WITHIN
+    of_stretch = np.concatenate([np.full(len(calm_keys), rest), swing])
+    return of, widened(moved, rest, lasting_s, quarter_s, of, of_stretch, sigma), sigma
 
 
 def _n_blocks(moved: Displaced, length_s: float) -> int:

@@ -94,11 +94,12 @@ def _combined(world: World, found: VarianceFactors, *, in_stretches: bool) -> Va
     have in common over time is sway, unless stretches hold it or nothing sways.
     """
     if in_stretches:
-        return replace(world.noise, correlation=found.correlation)
+        return replace(world.noise, correlation=found.correlation, pose_correlation=found.pose_correlation)
     sways = bool(np.bincount(world.cluster, minlength=1).max() > 1)
     correlation = 1.0 if sways and not world.errs_slowly else found.correlation
     noise = world.noise
-    return VarianceFactors(noise.flower * found.flower, noise.pose * found.pose, correlation, noise.sway * found.sway)
+    flower, pose, sway = noise.flower * found.flower, noise.pose * found.pose, noise.sway * found.sway
+    return VarianceFactors(flower, pose, correlation, sway, found.pose_correlation)
 
 
 def say_how_sure(smoother: BatchSmoother, stated: Frames, stated_poses: PoseModel, world: World) -> None:
@@ -107,6 +108,7 @@ def say_how_sure(smoother: BatchSmoother, stated: Frames, stated_poses: PoseMode
     if world.errs_slowly:  # all observations of a flower say the same: its place is as uncertain as one of them
         smoother.correlation = float(np.bincount(smoother.landmark, minlength=1).max())
     _, smoother.poses = with_variances(stated, stated_poses, world.noise)
+    smoother.pose_correlation = world.noise.pose_correlation
 
 
 def with_unknown_scale(
