@@ -126,15 +126,16 @@ class BatchSmoother:
         """Information (n, 6, 6) that the given poses alone have about each camera pose, its neighbours held."""
         return self._pose_prior(e).z_information
 
-    def _pose_prior(self, e: Estimate) -> PosePrior:
+    def _pose_prior(self, e: Estimate, poses: PoseModel | None = None) -> PosePrior:
         """Pose errors are taken at the lever that the solution started with.
 
         Were they to follow it, longer levers would explain anything: a weight is no unknown.
         """
         if self._lever is None:
             self._lever = np.eye(6) if e.X is None else adjoint(inverse(e.X))
-        return pose_prior(self.poses, self._lever, e.T, e.X)
+        return pose_prior(poses or self.poses, self._lever, e.T, e.X)
 
+    pose_correlation = 1.0  # given poses count as one, where it is said how sure the result is
     _stretch_mean: Array | None = None
     _lever: Array | None = None
 
@@ -160,9 +161,9 @@ class BatchSmoother:
             "places in numbers: are they copies of each other, or their covariances far from their errors?"
         )
 
-    def linearised(self, e: Estimate) -> Linearised:
-        """The problem at an estimate, every observation weighted by its robust weight."""
-        pairs, prior = self.pairs, self._pose_prior(e)
+    def linearised(self, e: Estimate, poses: PoseModel | None = None) -> Linearised:
+        """The problem at an estimate, every observation weighted by its robust weight; ``poses`` instead of its own."""
+        pairs, prior = self.pairs, self._pose_prior(e, poses)
         A_z, A_l, r = self._weighted(e)
         mean = np.zeros((len(pairs.stretch_sigma), 3)) if self._stretch_mean is None else self._stretch_mean
         within = pairs.stretch >= 0
@@ -221,8 +222,9 @@ class BatchSmoother:
 
     def marginals(self, e: Estimate) -> Marginals:
         """Joint covariance of places and hand-eye transform; all else is eliminated, by GTSAM."""
+        poses = replace(self.poses, cov=self.poses.cov * self.pose_correlation)
         try:
-            H = whole.remaining(self.links, self.linearised(e))
+            H = whole.remaining(self.links, self.linearised(e, poses))
             H = 0.5 * (H + H.T)
             scale = 1.0 / np.sqrt(np.diag(H))
             L = np.linalg.cholesky(H * scale[:, None] * scale)

@@ -27,13 +27,15 @@ _LEAST_WHITE = 0.17  # share of the stated variance that changes from frame to f
 class VarianceFactors:
     """Factors on stated variances: of flowers, of poses, and how many observations in a row say the same thing.
 
-    ``sway``: on the squared displacements that clusters in motion are thought to have.
+    ``sway``: on the squared displacements that clusters in motion are thought to have. ``pose_correlation``: how many
+    given poses in a row err alike, as where an arm's own errors change slowly, or sway that all clusters share.
     """
 
     flower: float
     pose: float
     correlation: float
     sway: float = 1.0
+    pose_correlation: float = 1.0
 
 
 def variance_factors(smoother: BatchSmoother, estimate: Estimate) -> VarianceFactors:
@@ -46,14 +48,18 @@ def variance_factors(smoother: BatchSmoother, estimate: Estimate) -> VarianceFac
     redundancy_flower = 3.0 * (int(used.sum()) - smoother.n_places) - free_poses - float(of_displacement.sum())
     redundancy_pose = free_poses
     flower = _ratio(float((residual[used] ** 2).sum()), redundancy_flower)
-    pose = 1.0
+    pose, in_a_row = 1.0, 1.0
     if smoother.poses.cov_step is None:
         predicted = smoother.poses.given if estimate.X is None else smoother.poses.given @ estimate.X
         error = se3_log(inverse(predicted) @ estimate.T)
         seen = np.bincount(smoother.frame[used], minlength=n) > 0
-        pose = _ratio(float(np.einsum("ni,nij,nj->", error[seen], prior[seen], error[seen])), redundancy_pose)
+        white = np.where(seen[:, None], np.einsum("nji,nj->ni", np.linalg.cholesky(prior), error), 0.0)
+        pose = _ratio(float((white**2).sum()), redundancy_pose)
+        common = _integrated_autocorrelation(white.reshape(n, 2, 3), np.tile(seen[:, None], 2).astype(np.float64))
+        # Only the share that poses take of what is measured is seen of their errors; noise of flowers is white in it.
+        in_a_row = 1.0 + (common - 1.0) * 6.0 * n / max(free_poses, 1.0)
     sway = _ratio(*_of_sway(smoother, estimate, of_displacement))
-    return VarianceFactors(flower, pose, _correlation_factor(smoother, residual, used, n), sway)
+    return VarianceFactors(flower, pose, _correlation_factor(smoother, residual, used, n), sway, in_a_row)
 
 
 def _of_sway(smoother: BatchSmoother, estimate: Estimate, taken: Array) -> tuple[float, float]:
