@@ -13,6 +13,7 @@ from cluster_slam.online.journal import Told
 from cluster_slam.online.tracker import OnlineTracker
 from cluster_slam.records import Calibration, Clusters, Diagnostics, Drift, Flowers, IntArray, Result, Session, State
 
+_TOLD_APART = 0.5  # of how far flowers stand apart: an error, one sigma, that takes one for another
 _DRIFTING = (
     "poses drift: what odometry errs over the whole way is not in the covariances of places and poses, and where "
     "the way comes back to a place nothing is corrected; smoothing the session does both"
@@ -31,7 +32,7 @@ def make_result(session: Session, tracker: OnlineTracker, told: Told, timings: d
     flower_ids[order], cluster_ids[order] = told.rows["flower"], told.rows["cluster"]
     reasons[order], nis[order] = told.rows["reason"], told.rows["nis"]
     flowers, clusters = _tables(session, tracker, flower_ids)
-    poor = _shortcomings(flower_ids, len(flowers))
+    poor = (*_shortcomings(flower_ids, len(flowers)), *_astray(tracker, flowers))
     drifting = (_DRIFTING,) if session.pose_error == "odometry" else ()
     warnings = (*session.warnings, *poor, *drifting, *(text.partition(" ")[2] for text in told.warnings))
     return Result(
@@ -116,6 +117,21 @@ def _noise(tracker: OnlineTracker) -> dict[str, float]:
 
 def _calibration(tracker: OnlineTracker) -> Calibration | None:
     return None if tracker.X is None else Calibration(tracker.X, tracker.cov_X)
+
+
+def _astray(tracker: OnlineTracker, flowers: Flowers) -> tuple[str, ...]:
+    """That the way was lost, where odometry alone led it farther than flowers stand apart."""
+    if len(flowers) < 2:
+        return ()
+    gap = np.linalg.norm(flowers.positions[:, None] - flowers.positions[None], axis=-1)
+    np.fill_diagonal(gap, np.inf)
+    spacing, astray = float(np.median(gap.min(0))), tracker.astray_watch.most_m
+    if astray < _TOLD_APART * spacing:
+        return ()
+    return (
+        f"lost: where fewer than three known flowers were in view, odometry may have erred by {astray:.2g} m; "
+        f"flowers stand {spacing:.2g} m apart: identities and places from there on are not to be relied on",
+    )
 
 
 def _shortcomings(flower_ids: IntArray, n_flowers: int) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from cluster_slam.online.odometry import diagonal, step_cov
 from cluster_slam.online.records import Tracks, Update
 from cluster_slam.online.tracks import tracks_of
 from cluster_slam.online.upkeep import merge_doubles, regroup, solve_all, solve_near, tell_lost
-from cluster_slam.online.watch import MountWatch, NoiseWatch
+from cluster_slam.online.watch import AstrayWatch, MountWatch, NoiseWatch
 from cluster_slam.online.world import World
 from cluster_slam.records import Calibration, Frame, IntArray, PoseError, RejectReason, StatedNoise
 from tracking.ukf import prepare
@@ -68,10 +68,12 @@ class OnlineTracker:
         self.cov_given = self._in_camera(diagonal(n.pose_rotation, n.pose_translation))
         self.intake = Intake()
         self.noise_watch, self.mount_watch = NoiseWatch(), MountWatch(self.cov_given)
+        self.astray_watch = AstrayWatch()
         self.first_stamp = self.last_stamp = self.last_solve = self.last_all = self.last_group = -np.inf
         self.T = np.eye(4) if self.X0 is None else self.X0
         self.pose_cov = np.eye(6)
         self.last_given: Array | None = None
+        self.last_step_cov = np.zeros((6, 6))
         self.n_frames = 0
 
     def step(self, frame: Frame) -> Update:
@@ -99,6 +101,9 @@ class OnlineTracker:
     def _watch(self, seen: Seen, stamp: float) -> tuple[str, ...]:
         """Learn from the residuals how large errors are, and whether the camera has moved on its mount."""
         self.noise_watch.see(seen.chi2[self.world.flowers.n[seen.rows] >= _KNOWN])
+        if self.pose_error == "odometry":
+            first = self.world.flowers.first[seen.rows]
+            self.astray_watch.see(stamp, first, self.last_step_cov, self.world.view_depth())
         is_frozen = self.X0 is not None and self.world.map.is_frozen and self.pose_error == "absolute"
         if not (is_frozen and len(seen.rows) >= _FIXED):
             return ()
@@ -135,7 +140,8 @@ class OnlineTracker:
         D = inverse(X) @ step @ X
         back = adjoint(inverse(D))
         gap = max(dt / max(self.world.usual_dt, 1e-9), 1.0)
-        return self.T @ D, back @ self.pose_cov @ back.T + self._in_camera(step_cov(self.noise, se3_log(step), gap))
+        self.last_step_cov = self._in_camera(step_cov(self.noise, se3_log(step), gap))
+        return self.T @ D, back @ self.pose_cov @ back.T + self.last_step_cov
 
     def _in_camera(self, cov: Array) -> Array:
         """A covariance (6, 6) of the given poses, moved into the camera's frame."""

@@ -11,6 +11,7 @@ from tracking.gating import chi2_threshold
 
 _GAIN = 0.1  # of the logarithm of the factor, a frame with many points
 _MANY = 20
+_HOLDING = 3  # flowers that hold a pose
 _WIDEST = 16.0  # a sigma stated four times too small
 
 
@@ -29,6 +30,32 @@ class NoiseWatch:
             ratio = float(np.median(chi2)) / chi2_threshold(3, 0.5)
             step = _GAIN * min(len(chi2) / _MANY, 1.0)
             self.factor = float(np.clip(self.factor * max(ratio, 0.05) ** step, 1.0, _WIDEST))
+
+
+class AstrayWatch:
+    """How far odometry may have led astray, one sigma: flowers that stand nearer to each other cannot be told apart.
+
+    Three known flowers in view hold the way; without them odometry alone does, and its errors add up until three
+    flowers come back that were known before.
+    """
+
+    def __init__(self) -> None:
+        self.sigma_m, self.most_m = 0.0, 0.0
+        self._turn_var = self._shift_var = 0.0
+        self._held = np.inf  # stamp of the last frame whose place in the map is certain
+
+    def see(self, stamp: float, first: Array, step_cov: Array, depth: float) -> None:
+        """A frame saw landmarks (k,) first seen at ``first`` s, after a step with covariance (6, 6)."""
+        if not np.isfinite(self._held) and len(first) < _HOLDING:
+            return
+        if (first <= self._held).sum() >= _HOLDING:
+            self._turn_var = self._shift_var = self.sigma_m = 0.0
+            self._held = stamp
+        elif len(first) < _HOLDING:
+            self._turn_var += float(np.trace(step_cov[:3, :3]))
+            self._shift_var += float(np.trace(step_cov[3:, 3:]))
+            self.sigma_m = float(np.sqrt(self._shift_var + self._turn_var * depth**2))
+            self.most_m = max(self.most_m, self.sigma_m)
 
 
 class MountWatch:

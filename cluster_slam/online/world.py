@@ -125,11 +125,15 @@ class World:
         visible: BoolArray = ((rays > self.low - margin) & (rays < self.high + margin)).all(axis=1)
         return visible
 
+    def view_depth(self) -> float:
+        """Middle of the depths in which points were seen, m; zero before any was."""
+        return float(0.5 * (self.low[2] + self.high[2])) if np.isfinite(self.low[2]) else 0.0
+
     def view_volume(self) -> float:
         """How much space one look holds, m^3."""
         if not np.isfinite(self.low).all():
             return 1.0
-        depth = 0.5 * (self.low[2] + self.high[2])
+        depth = self.view_depth()
         width, height = np.maximum(self.high - self.low, 0.1)[:2] * depth
         return float(width * height * depth)
 
