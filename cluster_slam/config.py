@@ -61,7 +61,7 @@ class ParticleConfig:
     gap_steps: float = 25.0  # usual steps without a point after which a map of its own begins ...
     fewest_points: int = 30  # ... if so many points are seen before the next one
     n_motions: int = 80  # in a gap that are tried as the beginning of a joint match, beside what odometry says
-    n_maps: int = 3  # of what lies between two gaps, drawn independently
+    n_maps: int = 3  # of what lies between two gaps, drawn independently until two agree, at most
     n_ways: int = 16  # of joining two maps that are smoothed before they are compared
     n_wholes: int = 4  # joined maps that are carried along until later points decide ...
     lead: float = 100.0  # ... if they cost at most so much more than the best, in chi-square

@@ -33,7 +33,8 @@ from cluster_slam.association.submaps import (
 from cluster_slam.geometry import Array
 
 _SAME = 0.98  # of the points have the same landmark: then two maps are one
-_FEW_MERGES = 5  # pairs of landmarks that are tried as one before ways are compared
+_FEW_MERGES = 5  # pairs of landmarks that are tried as one when stretches have been associated again
+_N_AGAIN = 2  # ways of joining maps in which the stretches of the smaller map are
 
 
 def assemble(session: DriftSession) -> list[State]:
@@ -57,8 +58,11 @@ def _maps(session: DriftSession, first: int, end: int) -> list[Part]:
     if n < session.config.fewest_points:
         return [as_part(piece, State(piece.given, np.full(n, -1), np.empty((0, 3)), 0.0), first)]
     price, n_maps = session.config.growing_cost, session.config.n_maps
-    grown = _best([grow(piece) for _ in range(n_maps)], n_maps, 2.0 * session.config.lead)
-    again = [redo(piece, state, price, _FEW_MERGES) for state in grown]
+    grown: list[State] = []
+    while len(grown) < n_maps and len(_best(grown, n_maps)) == len(grown):  # until two are the same
+        grown.append(grow(piece))
+    likely = _best(grown, n_maps, 2.0 * session.config.lead)
+    again = [redo(piece, state, price, _FEW_MERGES) for state in likely]
     return [as_part(piece, state, first) for state in _best(again, n_maps)]
 
 
@@ -72,8 +76,8 @@ def as_part(session: DriftSession, state: State, first: int) -> Part:
 def _joined(session: DriftSession, large: list[Part], small: list[Part]) -> list[Part]:
     """The maps of two neighbours as one, in the likeliest ways.
 
-    Whether one way is likelier than another shows when both have been associated again: a landmark that two tubes share
-    hides what speaks for the right way.
+    Whether one way is likelier than another shows when landmarks have been merged and parted in both: one that two
+    tubes share, or two that are one tube, hide what speaks for the right way.
     """
     config, first = session.config, min(large[0].first, small[0].first)
     union = session.between(first, max(large[0].end, small[0].end))
@@ -85,9 +89,10 @@ def _joined(session: DriftSession, large: list[Part], small: list[Part]) -> list
     ways = [union.labels.settle(way.T, way.label, way.places, price, 2) for way in _ways(session, large, small)]
     span = (small[0].first - first, small[0].end - first)
     likely = _best(ways, config.n_wholes, 2.0 * config.lead)
-    again = [union.labels.merge(redo_once(union, way, span, price, _FEW_MERGES), price) for way in likely]
-    parted = [split(union.labels, way, price) for way in again]
-    return [as_part(union, way, first) for way in _best(parted, config.n_wholes, config.lead)]
+    merged = [split(union.labels, union.labels.merge(way, price), price) for way in likely]
+    best = _best(merged, config.n_wholes, config.lead)
+    again = [redo_once(union, way, span, price, _FEW_MERGES) for way in best[:_N_AGAIN]]
+    return [as_part(union, way, first) for way in _best([*again, *best[_N_AGAIN:]], config.n_wholes, config.lead)]
 
 
 def _ways(session: DriftSession, large: list[Part], small: list[Part]) -> list[Part]:
