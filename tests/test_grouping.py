@@ -10,7 +10,7 @@ from cluster_slam.config import GroupingConfig
 from cluster_slam.geometry import Array
 from cluster_slam.grouping import Motion, group_flowers
 from cluster_slam.grouping.comotion import Ratios, log_likelihood_ratio, motion_evidence, pair_ratios, turning_ratio
-from cluster_slam.grouping.lasting import lasting_share, without_lasting
+from cluster_slam.grouping.lasting import lasting_share, noise_share, without_lasting
 from cluster_slam.grouping.likelihood import Likelihood
 from cluster_slam.grouping.partition import improve
 
@@ -133,6 +133,26 @@ def test_the_share_of_errors_that_last_is_found(share: float) -> None:
     moment = np.arange(N_FRAMES) // 12
     found = lasting_share(places, u, motion.var, moment)
     assert found == pytest.approx(share, rel=0.25, abs=0.01)
+
+
+def test_variances_that_hold_shared_sway_are_found_too_large() -> None:
+    rng = np.random.default_rng(61)
+    places = 0.03 * rng.standard_normal((3, 3))
+    motion = motion_of(np.zeros(3, dtype=np.int64), 2.0 * NOISE_M, rng=rng)
+    assert noise_share(places, motion.u, motion.var) == pytest.approx(1.0, abs=0.06)
+    stated = 5.0 * motion.var
+    assert noise_share(places, motion.u, stated) == pytest.approx(0.2, rel=0.06)
+    evidence = motion_evidence(places, Motion(motion.u, stated, STAMPS), 1.0).toarray()
+    assert evidence[np.triu_indices(3, 1)].min() > 1.5
+
+
+def test_misses_do_not_part_a_cluster_in_motion_where_errors_last() -> None:
+    """Means over a spell, over the frames of one flower and of another, differ where both swing."""
+    rng = np.random.default_rng(67)
+    motion = motion_of(np.zeros(2, dtype=np.int64), 0.02, rng=rng)
+    u = np.where((rng.random((N_FRAMES, 2)) < 0.3)[..., None], motion.u, np.nan)
+    var = np.where(np.isfinite(u[..., 0]), motion.var, np.nan)
+    assert pair_ratios(np.array([[0, 1]]), Motion(u, var, STAMPS), 0.1).ratio[0] < 0.02
 
 
 def test_what_stays_the_same_for_a_spell_is_subtracted_and_sway_is_not() -> None:

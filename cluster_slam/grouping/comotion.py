@@ -30,15 +30,22 @@ from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from cluster_slam.geometry import Array
-from cluster_slam.grouping.lasting import REMAINS, SPELL_S, lasting_share, without_lasting
-from cluster_slam.records import BoolArray, IntArray
+from cluster_slam.grouping.lasting import (
+    REMAINS,
+    SPELL_S,
+    WRONG,
+    lasting_share,
+    noise_share,
+    share_of_smallest,
+    without_lasting,
+)
+from cluster_slam.records import IntArray
 
 _WINDOW_S = 0.4  # motion hardly changes for so long
 _SIGNIFICANT = 11.3  # chi-square, 3 degrees of freedom, 99 %
 _FEWEST_FRAMES = 5
 _SYSTEMATIC = 0.02  # of an observation's variance: how well places at rest are known, which does not average out
 _SURE = 0.33  # motion of three times its own standard deviation is there at all
-_WRONG = 0.03  # of the frames of a pair: those with the largest differences are left out
 _APART = (0.66, 0.27)  # ratio of flowers of two clusters, mean and sigma
 _ALIKE = 0.3  # of pairs of two clusters lie anywhere from 0 to _RANGE instead, with the density of ratio ** (power - 1)
 _POWER = (0.4, 0.07)  # at no stretch of motion, and for each: one touch may move two clusters alike, ten do not
@@ -82,8 +89,10 @@ def motion_evidence(places: Array, motion: Motion, reach: float) -> csr_matrix:
     n = len(places)
     if len(pairs) == 0:
         return csr_matrix((n, n))
-    motion, lasting = _less_lasting(places, motion)
-    ratios = pair_ratios(pairs, motion, lasting)
+    var = noise_share(places, motion.u, motion.var) * motion.var
+    # Sway averages out over a spell: it is not taken for lasting errors, even where all neighbours move apart.
+    share = lasting_share(places, motion.u, var, _stretches(motion.stamps, SPELL_S))
+    ratios = pair_ratios(pairs, Motion(motion.u, var, motion.stamps), share)
     known = ratios.sigma < _SURE
     pairs, ratios = pairs[known], Ratios(*(x[known] for x in ratios))
     if len(pairs) == 0:
@@ -92,15 +101,6 @@ def motion_evidence(places: Array, motion: Motion, reach: float) -> csr_matrix:
     evidence = log_likelihood_ratio(ratios, turning_ratio(ratios, distance, _NEAR * reach))
     upper = csr_matrix((evidence, (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     return csr_matrix(upper + upper.T)
-
-
-def _less_lasting(places: Array, motion: Motion) -> tuple[Motion, float]:
-    """Without what stays the same for a spell, if errors do so; share of what still lasts for a stretch."""
-    # Sway averages out over a spell: it is not taken for lasting errors, even where all neighbours move apart.
-    share = lasting_share(places, motion.u, motion.var, _stretches(motion.stamps, SPELL_S))
-    if share == 0.0:
-        return motion, 0.0
-    return Motion(*without_lasting(motion.u, motion.var, motion.stamps, share), motion.stamps), REMAINS * share
 
 
 def log_likelihood_ratio(ratios: Ratios, turning: Array | float) -> Array:
@@ -168,23 +168,31 @@ def _normal(x: Array, mean: float | Array, sigma: Array) -> Array:
     return value
 
 
-def pair_ratios(pairs: NDArray[Any], motion: Motion, lasting: float) -> Ratios:
-    """Of pairs (p, 2), where ``lasting`` times the variance of an observation is that of errors that last."""
+def pair_ratios(pairs: NDArray[Any], motion: Motion, share: float) -> Ratios:
+    """Of pairs (p, 2), where errors that last have ``share`` times the variance of an observation."""
+    power = _power(motion, share)
     seen = np.isfinite(motion.var)
-    power = _power(motion, seen, lasting)
     stretch = _stretches(motion.stamps)
     sums = np.full((6, len(pairs)), np.nan)
     for i, (f, g) in enumerate(pairs.tolist()):
         signal = power[:, f] + power[:, g]
-        k = np.flatnonzero(seen[:, f] & seen[:, g] & (signal > 0.0))
-        if len(k) >= _FEWEST_FRAMES:
-            noise = motion.var[k, f] + motion.var[k, g]
-            sums[:, i] = _pair_sums(motion.u[k, f], motion.u[k, g], noise, signal[k], stretch[k] - stretch[k[0]])
+        k = np.flatnonzero(seen[:, f] & seen[:, g])
+        if len(k) < _FEWEST_FRAMES or not (signal[k] > 0.0).any():
+            continue
+        at = np.ix_(k, [f, g])
+        u, var = motion.u[at], motion.var[at]
+        if share > 0.0:  # of the same frames for both: in motion, means over different ones differ
+            u, var = without_lasting(u, var, motion.stamps[k], share)
+        used = np.isfinite(var).all(axis=1) & (signal[k] > 0.0)
+        if used.sum() >= _FEWEST_FRAMES:
+            k, u, noise = k[used], u[used], var[used].sum(axis=1)
+            sums[:, i] = _pair_sums(u[:, 0], u[:, 1], noise, signal[k], stretch[k] - stretch[k[0]])
+    lasting = REMAINS * share
     different, moved, noise_sq, noise_fourth, stretches, kept = sums
     total = moved - (1.0 + lasting) * noise_sq
     total[~(total > 0.0)] = np.nan
     # Of noise alone, whose squares are chi-square, those that are not the largest are smaller than the mean.
-    left = chi2.cdf(chi2.ppf(kept, 3), 5) / kept
+    left = share_of_smallest(kept)
     sigma: Array = np.hypot(np.sqrt(6.0 * noise_fourth), _SYSTEMATIC * noise_sq) / total
     return Ratios((different - (left + lasting) * noise_sq) / total, sigma, stretches, lasting * noise_sq / total)
 
@@ -205,7 +213,7 @@ def _pair_sums(u_f: Array, u_g: Array, noise: Array, signal: Array, stretch: Int
     motion_of = np.bincount(stretch, weight * signal)
     difference = weight * ((u_f - u_g) ** 2).sum(-1)
     # A single wrong observation must not part a cluster.
-    kept = np.argsort(difference)[: len(noise) - max(1, round(_WRONG * len(noise)))]
+    kept = np.argsort(difference)[: len(noise) - max(1, round(WRONG * len(noise)))]
     expected = (weight * noise)[kept]
     both = (weight * ((u_f**2).sum(-1) + (u_g**2).sum(-1)))[kept]
     n_stretches = motion_of.sum() ** 2 / (motion_of**2).sum()
@@ -213,9 +221,12 @@ def _pair_sums(u_f: Array, u_g: Array, noise: Array, signal: Array, stretch: Int
     return (*map(float, sums), len(kept) / len(noise))
 
 
-def _power(motion: Motion, seen: BoolArray, lasting: float) -> Array:
+def _power(motion: Motion, share: float) -> Array:
     """How far each flower (n, l) stood from rest around each frame, m^2 along any axis, from the other frames alone."""
-    stamps = motion.stamps
+    stamps, lasting = motion.stamps, REMAINS * share
+    if share > 0.0:
+        motion = Motion(*without_lasting(motion.u, motion.var, stamps, share), stamps)
+    seen = np.isfinite(motion.var)
     dt = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
     half = max(1, round(0.5 * _WINDOW_S / dt))
     information: Array = np.where(seen, 1.0 / np.where(seen, motion.var, 1.0), 0.0)

@@ -8,7 +8,7 @@ other: the difference of two such flowers, averaged over a moment, should be as 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ from cluster_slam.geometry import Array
 from cluster_slam.records import IntArray
 
 _FEWEST = 2  # frames of a moment
+_FEWEST_FRAMES = 30  # in which neighbours were seen together
+WRONG = 0.03  # of the frames of a pair: those with the largest differences are left out
 _MEDIAN = float(chi2.ppf(0.5, 3))
 _LARGEST = 100.0  # of the variance of an observation
 _STEPS = 40  # of a bisection
@@ -57,10 +59,36 @@ def _median(moments: Moments, share: float) -> float:
 
 def _moments(places: Array, u: Array, var: Array, moment: IntArray) -> Moments:
     """Of each flower and its nearest."""
-    nearest = np.asarray(cKDTree(places).query(places, k=2)[1])[:, 1]
-    pairs = np.unique(np.sort(np.column_stack([np.arange(len(places)), nearest]), axis=1), axis=0)
+    pairs = _neighbours(places)
     found = [_moments_of(u[:, f] - u[:, g], var[:, f] + var[:, g], moment) for f, g in pairs.tolist()]
     return Moments(*(np.concatenate(x) for x in zip(*found, strict=True)))
+
+
+def _neighbours(places: Array) -> NDArray[np.int64]:
+    """Pairs (p, 2) of a flower and its nearest."""
+    nearest = np.asarray(cKDTree(places).query(places, k=2)[1])[:, 1]
+    return np.unique(np.sort(np.column_stack([np.arange(len(places)), nearest]), axis=1), axis=0).astype(np.int64)
+
+
+def noise_share(places: Array, u: Array, var: Array) -> float:
+    """Share of the stated variances by which neighbours do differ, at most one.
+
+    Where flowers are taken for loose, sway that they share is taken for errors of each, and variances are too large.
+    """
+    shares = []
+    for f, g in _neighbours(places).tolist():
+        both = var[:, f] + var[:, g]
+        k = np.flatnonzero(np.isfinite(both))
+        if len(k) >= _FEWEST_FRAMES:
+            square = np.sort(((u[k, f] - u[k, g]) ** 2).sum(axis=-1) / both[k])
+            kept = square[: len(k) - max(1, round(WRONG * len(k)))]
+            shares.append(float(kept.mean()) / (3.0 * share_of_smallest(len(kept) / len(k))))
+    return min(1.0, float(np.median(shares))) if shares else 1.0
+
+
+def share_of_smallest(kept: Any) -> Any:
+    """Mean of the smallest ones, this share, of chi-square numbers with three degrees of freedom, over that of all."""
+    return chi2.cdf(chi2.ppf(kept, 3), 5) / kept
 
 
 def _moments_of(difference: Array, var: Array, moment: NDArray[np.int64]) -> Moments:
