@@ -453,6 +453,16 @@ def test_damage_that_sqlite_cannot_see_is_told(
     assert "is damaged" in said
 
 
+def test_a_name_that_is_no_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """SQLite quotes the damaged name in its own message, byte by byte."""
+    map_of(tmp_path, grown()).close()
+    path = tmp_path / "row3.map"
+    content = path.read_bytes().replace(b"CREATE INDEX clusters_of_plant", b"CREATE IND\x95X clusters_of_plant")
+    path.write_bytes(content)
+    assert run(["map", "check", str(path)]) == 2
+    assert "is damaged" in capsys.readouterr().err
+
+
 def test_a_map_without_its_end_is_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """SQLite reads what its last page lacks as zeros."""
     map_of(tmp_path, grown()).close()

@@ -14,6 +14,7 @@ from cluster_slam.constellation.match import Match, match
 from cluster_slam.constellation.search import glance
 from cluster_slam.geometry import Array
 from cluster_slam.records import Constellation, PlantMap
+from cluster_slam.remember.seen import habits_of
 
 FAMILIAR = 2.0  # log odds of a plant that the map has, before looking: most sessions show one
 REPEATED = 0.5  # a rival that explains more than this share of the best evidence is a clone, or a repeated structure
@@ -64,7 +65,8 @@ def decide(
     for k, plant in enumerate(moved):
         if k in closely:
             say(f"aligning with {plant.name}", 0.5 + 0.5 * k / len(moved))
-            matches.append(match(session, plant, config.match, config.growth, similarity=similarity))
+            options = as_learned(plants[k], config)
+            matches.append(match(session, plant, options.match, options.growth, similarity=similarity))
         else:
             matches.append(Match(plant.name, 0.0, -np.inf, -np.inf, False))
     matches.sort(key=lambda m: -m.evidence)
@@ -75,6 +77,15 @@ def decide(
         refusal, reason = _other_hand(session, plant, matches[0], config, similarity) or (refusal, reason)
     accepted = matches[0] if refusal is Refusal.NONE and matches else None
     return Decision(matches, probabilities, accepted, refusal, reason)
+
+
+def as_learned(plant: PlantMap, config: MapConfig) -> MapConfig:
+    """The options with what sessions of this plant have shown of what one sees, and of what is new to it."""
+    habits = habits_of(plant, config)
+    seen = replace(config.match, seen_share=habits.share, ghosts=config.match.ghosts * habits.at_once)
+    return replace(
+        config, match=seen, growth=replace(config.growth, new_per_day=config.growth.new_per_day * habits.since)
+    )
 
 
 def _is_doubtful(session: Constellation, best: Match, *, alone: bool) -> bool:

@@ -195,6 +195,8 @@ def open_map(path: str | Path) -> MapStore:
         _prepare(path, connection)
     except sqlite3.Error as error:
         raise refused(path, error) from None
+    except UnicodeDecodeError:  # of what SQLite says itself
+        raise InputError(f"{path}: is damaged (a name in it is no text), expected a map") from None
     return MapStore(path, connection)
 
 
