@@ -7,8 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from cluster_slam import OnlineTracker
+from cluster_slam.config import OnlineConfig
 from cluster_slam.live.replay import Replay
 from cluster_slam.online.births import ALONE, BESIDE, DOUBTFUL, Births
+from cluster_slam.online.life import may_be_missing
+from cluster_slam.online.world import World
 from cluster_slam.records import RejectReason
 from cluster_slam.simulate import PRESETS, simulate_session
 
@@ -72,3 +75,27 @@ def test_lone_clutter_gets_no_name_and_flowers_get_theirs_at_once() -> None:
     assert (found[late & (true >= 0)] >= 0).mean() > 0.98
     unnamed = np.concatenate([u.reasons for u in updates])[found < 0]
     assert np.isin(unnamed, [RejectReason.UNCONFIRMED, RejectReason.TAKEN]).mean() > 0.95
+
+
+def test_a_new_flower_may_be_a_landmark_nearby_that_was_moved() -> None:
+    world = World(OnlineConfig(), None, 0)
+    world.widen_view(np.array([[-0.5, -0.5, 0.5], [0.5, 0.5, 1.5]]))
+    cov, lever = np.tile(1e-6 * np.eye(3), (2, 1, 1)), np.zeros((2, 3, 6))
+    places = np.array([[0.0, 0.0, 1.0], [0.03, 0.0, 1.0]])
+    table = world.flowers
+    landmark, new = table.add(places, cov, lever, np.full(2, world.new_cluster(0.0)), 0.0).tolist()
+    table.confirmed[landmark] = table.told[landmark] = True
+    world.place_anchors(np.array([0]))
+    rows = np.array([landmark, new])
+
+    def blocked(first: float, last: float) -> list[bool]:
+        table.first[new], table.last[landmark] = first, last
+        found: list[bool] = may_be_missing(world, rows, world.snapshot(2.0), np.eye(4), 2.0).tolist()
+        return found
+
+    assert blocked(1.95, 1.9) == [False, True]  # it went when the other came
+    assert blocked(1.8, 1.9) == [False, False]  # both were there
+    assert blocked(1.95, 2.0) == [False, False]  # it is there now
+    assert blocked(1.95, 0.5) == [False, False]  # it has long been hidden
+    table.place[new] = [0.3, 0.0, 1.0]
+    assert blocked(1.95, 1.9) == [False, False]  # too far

@@ -22,6 +22,7 @@ _GHOST_LOOKS = 15  # looks at a landmark before it can be found to be none ...
 _GHOST_SHARE = 0.3  # ... seen in so small a share of them, compared with the others
 _WILD_CHI2 = 150.0  # 3 degrees of freedom: errors of up to five times what is stated ...
 _WILD_SHARE = 0.6  # ... and within this share of how close flowers stand
+_MISSING_S = 1.0  # a landmark that was seen so lately may have been moved by a touch
 _FLOWER_SHARE = 0.3  # radius of a flower over how close they stand
 
 
@@ -42,11 +43,31 @@ def live(world: World, seen: Seen, view: View, T: Array, w: Array) -> tuple[IntA
     rows = row_of[shown]
     n = table.n[rows]
     is_seen_often = (n >= world.config.confirm_hits) & ~world.births.is_doubtful(table.kind[rows])
-    table.told[rows] |= table.confirmed[rows] | is_seen_often | world.births.is_flower(table.kind[rows], n)
+    is_known = table.confirmed[rows] | is_seen_often | world.births.is_flower(table.kind[rows], n)
+    table.told[rows] |= is_known & ~may_be_missing(world, rows, seen.at, T, view.stamp)
     shown[shown] = table.told[rows]
     reasons[(row_of >= 0) & ~shown] = int(RejectReason.UNCONFIRMED)
     confirm(world, seen, view.stamp)
     return np.where(shown, table.ids[row_of] if len(table) else -1, -1), reasons
+
+
+def may_be_missing(world: World, rows: IntArray, at: Snapshot, T: Array, stamp: float) -> BoolArray:
+    """Which flowers (k,) whose ids were not yet given out may be landmarks that a touch has moved.
+
+    One that hangs within reach was seen a moment ago, should be in view, and was not seen since this one was found.
+    """
+    table = world.flowers
+    found: BoolArray = np.zeros(len(rows), dtype=bool)
+    new = np.flatnonzero(~table.told[rows])
+    gone = np.flatnonzero(table.told & table.confirmed & (table.last < stamp) & (table.last > stamp - _MISSING_S))
+    if not (len(new) and len(gone)):
+        return found
+    gone = gone[world.in_view(T, world.expected(gone, at), VIEW_RIM)]
+    expected = world.expected(gone, at)
+    gap = table.place[rows[new]][:, None] - expected[None]
+    near = np.einsum("abi,abi->ab", gap, gap) < world.config.follow.reach_m**2
+    found[new] = (near & (table.last[gone] < table.first[rows[new]][:, None])).any(axis=1)
+    return found
 
 
 def claim_wild(world: World, seen: Seen, view: View, w: Array, row_of: IntArray) -> None:
