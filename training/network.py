@@ -11,7 +11,9 @@ WIDTHS = (16, 32, 64, 128)  # at strides 2, 4, 8, 16; multiples of 16 cost onnxr
 
 def _conv(a: int, b: int, kernel: int, stride: int = 1, groups: int = 1) -> nn.Sequential:
     return nn.Sequential(
-        nn.Conv2d(a, b, kernel, stride, kernel // 2, groups=groups, bias=False), nn.BatchNorm2d(b), nn.ReLU()
+        nn.Conv2d(a, b, kernel, stride, kernel // 2, groups=groups, bias=False),
+        nn.BatchNorm2d(b),
+        nn.ReLU(inplace=True),
     )
 
 

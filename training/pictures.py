@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -97,11 +98,20 @@ def crops(picture: Picture, size: int, count: int, rng: np.random.Generator) -> 
     return found
 
 
-def make_examples(first_seed: int, n_worlds: int, size: int, per_picture: int) -> list[Example]:
+def usual_distance(seed: int) -> dict[str, Any]:
+    """Changes of a random plant: seen from as far, and with such a lens, as in a usual session."""
+    rng = np.random.default_rng([seed, 79])
+    near = float(rng.uniform(0.4, 0.7))
+    return {"distance_min_m": near, "distance_max_m": near + 0.2, "focal_px": float(rng.uniform(400.0, 460.0))}
+
+
+def make_examples(
+    first_seed: int, n_worlds: int, size: int, per_picture: int, changes: Callable[[int], dict[str, Any]] | None = None
+) -> list[Example]:
     """Examples of many worlds; the same seeds give the same examples."""
     found: list[Example] = []
     for seed in range(first_seed, first_seed + n_worlds):
         rng = np.random.default_rng([seed, 78])
-        for picture in render_world(seed):
+        for picture in render_world(seed, None if changes is None else changes(seed)):
             found += crops(picture, size, per_picture, rng)
     return found
