@@ -88,14 +88,16 @@ def test_a_new_flower_may_be_a_landmark_nearby_that_was_moved() -> None:
     world.place_anchors(np.array([0]))
     rows = np.array([landmark, new])
 
-    def blocked(first: float, last: float) -> list[bool]:
-        table.first[new], table.last[landmark] = first, last
+    def blocked(last: float) -> list[bool]:
+        """With the landmark last seen then; the frame is at 2 s."""
+        table.last[landmark], table.last[new] = last, 2.0
         found: list[bool] = may_be_missing(world, rows, world.snapshot(2.0), np.eye(4), 2.0).tolist()
         return found
 
-    assert blocked(1.95, 1.9) == [False, True]  # it went when the other came
-    assert blocked(1.8, 1.9) == [False, False]  # both were there
-    assert blocked(1.95, 2.0) == [False, False]  # it is there now
-    assert blocked(1.95, 0.5) == [False, False]  # it has long been hidden
+    assert blocked(1.9) == [False, True]  # it went when the other came
+    assert blocked(0.5) == [False, False]  # it has long been hidden
     table.place[new] = [0.3, 0.0, 1.0]
-    assert blocked(1.95, 1.9) == [False, False]  # too far
+    assert blocked(1.9) == [False, False]  # too far
+    table.place[new] = [0.03, 0.0, 1.0]
+    assert blocked(2.0) == [False, False]  # both are there ...
+    assert blocked(1.9) == [False, False]  # ... so they are two

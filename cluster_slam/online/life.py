@@ -22,6 +22,7 @@ _GHOST_LOOKS = 15  # looks at a landmark before it can be found to be none ...
 _GHOST_SHARE = 0.3  # ... seen in so small a share of them, compared with the others
 _WILD_CHI2 = 150.0  # 3 degrees of freedom: errors of up to five times what is stated ...
 _WILD_SHARE = 0.6  # ... and within this share of how close flowers stand
+_MOST_MET = 200  # flowers, before those that wait no more for their id are left out
 _MISSING_S = 1.0  # a landmark that was seen so lately may have been moved by a touch
 _FLOWER_SHARE = 0.3  # radius of a flower over how close they stand
 
@@ -52,21 +53,25 @@ def live(world: World, seen: Seen, view: View, T: Array, w: Array) -> tuple[IntA
 
 
 def may_be_missing(world: World, rows: IntArray, at: Snapshot, T: Array, stamp: float) -> BoolArray:
-    """Which flowers (k,) whose ids were not yet given out may be landmarks that a touch has moved.
+    """Which flowers (k,) seen in this frame, whose ids were not yet given out, may be landmarks that a touch has moved.
 
-    One that hangs within reach was seen a moment ago, should be in view, and was not seen since this one was found.
+    One that hangs within reach was seen a moment ago and should be in view, is not seen now, and never was together
+    with this one.
     """
     table = world.flowers
     found: BoolArray = np.zeros(len(rows), dtype=bool)
     new = np.flatnonzero(~table.told[rows])
-    gone = np.flatnonzero(table.told & table.confirmed & (table.last < stamp) & (table.last > stamp - _MISSING_S))
-    if not (len(new) and len(gone)):
+    others = np.flatnonzero(table.told & table.confirmed & (table.last > stamp - _MISSING_S))
+    if not (len(new) and len(others)):
         return found
-    gone = gone[world.in_view(T, world.expected(gone, at), VIEW_RIM)]
-    expected = world.expected(gone, at)
-    gap = table.place[rows[new]][:, None] - expected[None]
+    others = others[world.in_view(T, world.expected(others, at), VIEW_RIM)]
+    gap = table.place[rows[new]][:, None] - world.expected(others, at)[None]
     near = np.einsum("abi,abi->ab", gap, gap) < world.config.follow.reach_m**2
-    found[new] = (near & (table.last[gone] < table.first[rows[new]][:, None])).any(axis=1)
+    is_here = table.last[others] >= stamp
+    for k, nearby in zip(new.tolist(), near, strict=True):
+        met = world.met.setdefault(int(table.ids[rows[k]]), set())
+        met.update(table.ids[others[nearby & is_here]].tolist())
+        found[k] = any(i not in met for i in table.ids[others[nearby & ~is_here]].tolist())
     return found
 
 
@@ -220,3 +225,6 @@ def forget(world: World) -> None:
             world.births.were_false(table.kind[row : row + 1], table.n[row : row + 1])
         gone |= ghost
     world.drop(gone)
+    if len(world.met) > _MOST_MET:
+        waiting = table.ids[~table.told].tolist()
+        world.met = {i: world.met[i] for i in waiting if i in world.met}

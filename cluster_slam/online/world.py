@@ -49,6 +49,7 @@ class World:
         self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)  # of x / z, y / z and z of all points so far
         self.spacing = np.inf  # m, how close flowers stand
         self.births = Births()
+        self.met: dict[int, set[int]] = {}  # landmarks that were seen together with a flower without an id as yet
         self.depth_sums = DepthSums()  # how the stated noise grows with depth
         self.usual_dt = 1.0 / 30.0
         self.x = np.zeros(6)  # hand-eye tangent
