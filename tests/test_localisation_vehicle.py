@@ -9,6 +9,7 @@ import pytest
 
 from cluster_slam.association.calibration import delayed
 from cluster_slam.geometry import Array, inverse, se3_exp, se3_log, transform
+from cluster_slam.localisation.beliefs import Beliefs, everywhere
 from cluster_slam.localisation.instruments import news_of, put_right
 from cluster_slam.localisation.landmarks import Landmarks, landmarks
 from cluster_slam.localisation.motion import motion_of
@@ -94,3 +95,32 @@ def test_points_of_a_piece_count_for_less_the_closer_they_follow() -> None:
     assert news[4] == pytest.approx((1.0 - c) / (1.0 + c))
     assert news[2] < 0.13
     assert news[3] > 0.99
+
+
+def test_views_of_beliefs_have_the_numerical_derivative() -> None:
+    mean = np.array([[0.3, -0.2, 0.7, 0.04, 0.06], [1.0, 2.0, -2.0, -0.02, -0.03]])
+    cov, marks = np.tile(np.diag([0.01, 0.02, 0.001, 1e-4, 1e-4]), (2, 1, 1)), np.array([[[2.0, 1.0]], [[0.5, 0.1]]])
+    rows, q = np.arange(2), np.array([1.0, 0.5])
+
+    def expected(m: Array) -> Array:
+        return q - Beliefs(m, cov, np.ones(2), np.zeros(2)).views(rows, q, marks)[0][:, 0]
+
+    _, H, HPH = Beliefs(mean, cov, np.ones(2), np.zeros(2)).views(rows, q, marks)
+    step = 1e-6 * np.eye(5)
+    numeric = np.stack([(expected(mean + e) - expected(mean - e)) / 2e-6 for e in step], axis=-1)
+    np.testing.assert_allclose(H[:, 0], numeric, atol=1e-8)
+    np.testing.assert_allclose(HPH[:, 0], numeric @ cov @ np.swapaxes(numeric, 1, 2), rtol=1e-6)
+
+
+def test_one_point_leaves_every_heading_and_side_open() -> None:
+    """Each belief sees the point where it was, and is as unsure along the ray as point, gain and offset are."""
+    q, S = np.array([3.0, 0.5]), np.diag([0.01, 0.01]) ** 2
+    beliefs = everywhere(q, S, PLACES)
+    places = PLACES[np.arange(8).repeat(144)] * np.column_stack([np.ones(len(beliefs)), beliefs.side])
+    off, _, HPH = beliefs.views(np.arange(len(beliefs)), q, places[:, None])
+    np.testing.assert_allclose(off, 0.0, atol=1e-6)
+    assert (np.trace(HPH[:, 0], axis1=1, axis2=2) < 2.1 * 0.01**2).all()  # of where it is seen: the point's own
+    away = np.sqrt(beliefs.cov[:, 0, 0] + beliefs.cov[:, 1, 1])
+    lever = np.hypot(3.0, 0.5)
+    sigma = np.sqrt(2 * 0.01**2 + (0.03 * lever) ** 2 + 0.05**2 + (np.pi / 72 * lever) ** 2)
+    np.testing.assert_allclose(away, sigma, rtol=0.01)

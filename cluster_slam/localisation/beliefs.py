@@ -21,6 +21,7 @@ _GAIN, _OFFSET = 0.03, 0.05  # one sigma of what ranges err by for good: a share
 _WANDER = 0.02  # ... and how far they move with each frame, of that
 _N_HEADINGS = 72  # at first, evenly around
 _ANYWHERE_M = 1e3
+_MOST_PAIRS = 60_000  # of beliefs and landmarks, at once
 
 
 @dataclass(slots=True, eq=False)
@@ -65,18 +66,27 @@ class Beliefs:
 
         Each belief draws which landmark (k, 2) it is, or none. Returns the probability of none (n,) for each belief.
         """
-        off, H, HPH = self.views(q, places)
+        none = np.empty(len(self))
+        for rows in np.array_split(np.arange(len(self)), 1 + len(self) * len(places) // _MOST_PAIRS):
+            none[rows] = self._see(rows, q, S, news, places, area, rng)
+        return none
+
+    def _see(
+        self, rows: IntArray, q: Array, S: Array, news: float, places: Array, area: float, rng: np.random.Generator
+    ) -> Array:
+        mirrored = np.stack([np.ones(len(rows)), self.side[rows]], axis=1)
+        off, H, HPH = self.views(rows, q, places * mirrored[:, None])
         n, k = off.shape[:2]
         narrow = (1.0 - WIDE_SHARE) * _density(off, HPH + S)
         wide = WIDE_SHARE * _density(off, HPH + WIDE**2 * S)
         each = np.concatenate([narrow, wide], axis=1) * (1.0 - FALSE_SHARE) / k
         total = each.sum(1) + FALSE_SHARE / area
-        self.log_weight = self.log_weight + news * np.log(total)
+        self.log_weight[rows] += news * np.log(total)
         draw = (np.cumsum(each, axis=1) < rng.random((n, 1)) * total[:, None]).sum(1)
         seen = np.flatnonzero(draw < 2 * k)
         mark = draw[seen] % k
         factor = np.where(draw[seen] < k, 1.0, WIDE**2) / news
-        self._update(seen, off[seen, mark], H[seen, mark], HPH[seen, mark] + factor[:, None, None] * S)
+        self._update(rows[seen], off[seen, mark], H[seen, mark], HPH[seen, mark] + factor[:, None, None] * S)
         return np.asarray(FALSE_SHARE / area / total)
 
     def _update(self, rows: IntArray, off: Array, H: Array, innovation_cov: Array) -> None:
@@ -86,21 +96,24 @@ class Beliefs:
         cov = self.cov[rows] - K @ np.swapaxes(PH, 1, 2)
         self.cov[rows] = 0.5 * (cov + np.swapaxes(cov, 1, 2))
 
-    def views(self, q: Array, places: Array) -> tuple[Array, Array, Array]:
-        """Point q (2,) minus where each landmark is expected (n, k, 2), the Jacobian (n, k, 2, 5), and its H P H'."""
-        R, dR = _turns(self.mean[:, 2])
-        marks = places[None] * np.stack([np.ones(len(self)), self.side], axis=1)[:, None]
-        away = marks - self.mean[:, None, :2]
+    def views(self, rows: IntArray, q: Array, marks: Array) -> tuple[Array, Array, Array]:
+        """Point q (2,) minus where beliefs ``rows`` (n,) expect landmarks (n, k, 2).
+
+        With it the Jacobian H (n, k, 2, 5) of what is expected, and H P H' (n, k, 2, 2).
+        """
+        mean = self.mean[rows]
+        R, dR = _turns(mean[:, 2])
+        away = marks - mean[:, None, :2]
         v = away @ R  # along the vehicle's axes: R' away
         r = np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-6)
-        gain, offset = np.exp(self.mean[:, 3])[:, None, None], self.mean[:, 4][:, None, None]
+        gain, offset = np.exp(mean[:, 3])[:, None, None], mean[:, 4][:, None, None]
         u = v / r
         by_v = (gain + offset / r)[..., None] * np.eye(2) - (offset / r)[..., None] * u[..., :, None] * u[..., None, :]
         H = np.empty((*v.shape, 5))
         H[..., :2] = -by_v @ np.swapaxes(R, 1, 2)[:, None]
         H[..., 2] = (by_v @ (away @ dR)[..., None])[..., 0]
         H[..., 3], H[..., 4] = gain * v, u
-        HP = (H.reshape(len(self), -1, 5) @ self.cov).reshape(H.shape)
+        HP = (H.reshape(len(rows), -1, 5) @ self.cov[rows]).reshape(H.shape)
         return q - (gain * v + offset * u), H, np.einsum("nkia,nkja->nkij", HP, H)
 
 
@@ -116,9 +129,8 @@ def everywhere(q: Array, S: Array, places: Array) -> Beliefs:
     mean[:, :2] = target - _turns(h)[0] @ q
     spread = np.array([_ANYWHERE_M, _ANYWHERE_M, np.pi / _N_HEADINGS, _GAIN, _OFFSET])
     out = Beliefs(mean, np.tile(np.diag(spread**2), (n, 1, 1)), side, np.zeros(n))
-    off, H, HPH = out.views(q, places)
-    rows = np.arange(n)
-    out._update(rows, off[rows, mark], H[rows, mark], HPH[rows, mark] + S)
+    off, H, HPH = out.views(np.arange(n), q, target[:, None])
+    out._update(np.arange(n), off[:, 0], H[:, 0], HPH[:, 0] + S)
     return out
 
 
