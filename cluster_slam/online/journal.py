@@ -40,7 +40,13 @@ TENTATIVE, CONFIRMED, LOST, SWAYING, SEEN = 0, 1, 2, 4, 8  # bits of ``what``
 _STATES = {"tentative": TENTATIVE, "confirmed": CONFIRMED, "lost": LOST}
 _TRACKS_S = 0.1
 _TEXTS = ("revisions.txt", "warnings.txt")
-_OURS = ("cluster_slam.online.", "cluster_slam.graph.incremental", "cluster_slam.config", "cluster_slam.records")
+_OURS = (
+    "cluster_slam.online.",
+    "cluster_slam.graph.incremental",
+    "cluster_slam.config",
+    "cluster_slam.records",
+    "cluster_slam.association.depth_noise",
+)
 _PLAIN = {"list", "dict", "set", "frozenset", "tuple", "int", "float", "bool", "slice", "range", "deque", "bytearray"}
 _ARRAYS = {"_reconstruct", "ndarray", "dtype", "scalar", "_frombuffer", "_convert_to_numpy_array"}
 
