@@ -16,7 +16,7 @@ from cluster_slam.constellation.growth import DAY_S, at, memory_days
 from cluster_slam.constellation.identify import Identities
 from cluster_slam.io.map import open_map
 from cluster_slam.pipeline.remember import add
-from cluster_slam.remember.decide import as_learned
+from cluster_slam.remember.decide import decide
 from cluster_slam.remember.gauge import frame_covariance
 from cluster_slam.remember.hold import Seen, holding
 from cluster_slam.remember.predict import membership_cov
@@ -96,18 +96,16 @@ def test_the_share_of_flowers_that_are_seen_is_learned(tmp_path: Path) -> None:
         assert 0.45 < learned_seen_share(store.plant("row3"), MapConfig())[0] < 0.75
 
 
-def test_matching_expects_what_sessions_have_seen(tmp_path: Path) -> None:
-    """Half of the flowers are hidden each time: one that is missing says less against a plant than at first."""
-    plant = SeasonPlant(replace(SEASON, unseen_share=0.5, session=SimulateConfig(n_clusters=20)), seed=3)
+def test_what_was_not_looked_at_for_weeks_may_be_lost(tmp_path: Path) -> None:
+    """The same session against the same plant, 1 and 30 days on: 0.98^30 of the flowers are expected to be left."""
+    plant = SeasonPlant(replace(SEASON, session=SimulateConfig(n_clusters=12)), seed=3)
     with map_of(tmp_path, plant) as store:
-        first = as_learned(store.plant("row3"), MapConfig())
-        for day in (1.0, 2.0):
-            plant.grow_to(day)
-            assert add(store, rest_incoming(plant)).session is not None
-        later = as_learned(store.plant("row3"), MapConfig())
-    assert first == MapConfig()
-    assert 0.4 < later.match.seen_share < 0.7
-    assert later.match.margin == first.match.margin
+        known = store.plant("row3")
+    session = rest_incoming(plant).constellation
+    for days in (1.0, 30.0):
+        found = decide(replace(session, start=session.start + days * DAY_S), [known], MapConfig()).matches[0].found
+        assert found is not None
+        np.testing.assert_allclose(found.plant.flower_presence, 0.98**days, rtol=1e-9)
 
 
 def test_flowers_that_come_with_time_are_told_from_those_that_come_at_once(tmp_path: Path) -> None:

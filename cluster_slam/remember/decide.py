@@ -8,13 +8,13 @@ from enum import StrEnum
 
 import numpy as np
 
-from cluster_slam.config import MapConfig
-from cluster_slam.constellation.growth import at
+from cluster_slam.config import GrowthConfig, MapConfig
+from cluster_slam.constellation.growth import DAY_S, at
 from cluster_slam.constellation.match import Match, match
 from cluster_slam.constellation.search import glance
 from cluster_slam.geometry import Array
 from cluster_slam.records import Constellation, PlantMap
-from cluster_slam.remember.seen import habits_of
+from tracking.presence import persisted
 
 FAMILIAR = 2.0  # log odds of a plant that the map has, before looking: most sessions show one
 REPEATED = 0.5  # a rival that explains more than this share of the best evidence is a clone, or a repeated structure
@@ -59,14 +59,13 @@ def decide(
 ) -> Decision:
     """Match a session with plants as the map holds them, and decide."""
     say = progress or (lambda _stage, _fraction: None)
-    moved = [at(plant, session.start, config.growth) for plant in plants]
+    moved = [_expected(plant, session.start, config.growth) for plant in plants]
     closely = _worth_a_look(session, moved, config, similarity, say)
     matches = []
     for k, plant in enumerate(moved):
         if k in closely:
             say(f"aligning with {plant.name}", 0.5 + 0.5 * k / len(moved))
-            options = as_learned(plants[k], config)
-            matches.append(match(session, plant, options.match, options.growth, similarity=similarity))
+            matches.append(match(session, plant, config.match, config.growth, similarity=similarity))
         else:
             matches.append(Match(plant.name, 0.0, -np.inf, -np.inf, False))
     matches.sort(key=lambda m: -m.evidence)
@@ -79,13 +78,11 @@ def decide(
     return Decision(matches, probabilities, accepted, refusal, reason)
 
 
-def as_learned(plant: PlantMap, config: MapConfig) -> MapConfig:
-    """The options with what sessions of this plant have shown of what one sees, and of what is new to it."""
-    habits = habits_of(plant, config)
-    seen = replace(config.match, seen_share=habits.share, ghosts=config.match.ghosts * habits.at_once)
-    return replace(
-        config, match=seen, growth=replace(config.growth, new_per_day=config.growth.new_per_day * habits.since)
-    )
+def _expected(plant: PlantMap, time: float, growth: GrowthConfig) -> PlantMap:
+    """The plant at a time, with what was lost since it was last looked at as less likely there."""
+    since = np.maximum(np.nan_to_num(time - plant.flower_last_looked_at) / DAY_S, 0.0)
+    presence = persisted(plant.flower_presence, growth.lost_per_day, since)
+    return replace(at(plant, time, growth), flower_presence=presence)
 
 
 def _is_doubtful(session: Constellation, best: Match, *, alone: bool) -> bool:
