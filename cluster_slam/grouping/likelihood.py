@@ -52,9 +52,10 @@ class Likelihood:
         """``volume`` m^3 that one look of the camera holds, ``evidence`` (l, l) of motion."""
         n = len(places)
         self.places = places
-        self.log_view_side = log(volume) / 3.0
         sides = np.ptp(places, axis=0)
-        self.log_sides = np.log(np.maximum(np.maximum(sides, _THIN * sides.max()), _SMALLEST * volume ** (1.0 / 3.0)))
+        view_side = volume ** (1.0 / 3.0) if volume > 0.0 else max(float(sides.max()), 1.0)
+        self.log_view_side = log(view_side)
+        self.log_sides = np.log(np.maximum(np.maximum(sides, _THIN * sides.max()), _SMALLEST * view_side))
         self.known: BoolArray = np.zeros((n, n), dtype=bool)
         self.evidence: Array = np.zeros((n, n))
         if evidence is not None:
