@@ -500,3 +500,21 @@ def test_the_hand_eye_transform_is_known_as_well_as_is_said() -> None:
         error = se3_log(inverse(t.X) @ world.hand_eye.true)
         nees.append(float(error @ np.linalg.solve(t.cov_X, error)) / 6.0)
     assert np.mean(nees) < 2.2  # 24 degrees of freedom, one in a thousand
+
+
+def test_what_was_hardly_seen_at_rest_may_hang_elsewhere() -> None:
+    """All flowers of a cluster together; after seconds of rest nothing of it is left."""
+    t, _ = steps(frames(12))
+    table = t.world.flowers
+    rows = np.flatnonzero(table.confirmed)
+    doubt = np.array([k.doubt for k in t.world.clusters])[table.slot[rows]]
+    cov = t.joint_cov(rows).reshape(len(rows), 3, len(rows), 3)
+    assert (doubt > 0.004).any()
+    assert (np.einsum("faga->fga", cov)[np.arange(len(rows)), np.arange(len(rows))] >= doubt[:, None] ** 2).all()
+    mates = np.argwhere(np.triu(table.slot[rows][:, None] == table.slot[rows], 1))
+    assert len(mates)
+    for f, g in mates.tolist():
+        apart = cov[f, :, f] + cov[g, :, g] - cov[f, :, g] - cov[g, :, f]
+        assert np.sqrt(np.trace(apart)) < 2.0 * np.sqrt(np.trace(table.cov[rows[f]] + table.cov[rows[g]]))
+    late, _ = steps(frames())
+    assert min(k.doubt for k in late.world.clusters) < 1e-4

@@ -103,6 +103,11 @@ class ClusterTrack:
         unknown = float(np.trace(self.filter.P[8:11, 8:11]))
         return max(float(np.hypot(amplitude(self.filter.x, self.anchor), np.sqrt(unknown))), self.config.tremble_m)
 
+    @property
+    def doubt(self) -> float:
+        """How far from rest, m, one sigma an axis, it may be taken to rest, as it was hardly seen to hang still."""
+        return float(_SWUNG_M * np.exp(-0.5 * self.rested_s / _SETTLED_S))
+
     def now(self, stamp: float) -> tuple[Array, Array, Array]:
         """Centroid (3,), velocity (3,), and their covariance (6, 6), the map's own with it; predicted if not seen."""
         anchor = np.zeros(3) if self.anchor is None else self.anchor
@@ -204,7 +209,7 @@ class ClusterTrack:
         x, P = state_at_rest(anchor, self.config)
         x[6:8], P[6, 6], P[7, 7] = f.x[6:8], f.P[6, 6], f.P[7, 7]
         if self.n_flowers >= _SHAPE:
-            P[8:11, 8:11] += self.anchor_cov + _SWUNG_M**2 * np.exp(-self.rested_s / _SETTLED_S) * _EYE
+            P[8:11, 8:11] += self.anchor_cov + self.doubt**2 * _EYE
         return x, P
 
     def _loosen(self, f: UnscentedFilter, dt: float) -> None:

@@ -231,7 +231,11 @@ class OnlineTracker:
         return np.where(alive, ids, -1), np.where(alive, self.world.names()[table.slot[at]], -1)
 
     def joint_cov(self, rows: IntArray) -> Array:
-        """Joint covariance (3 k, 3 k) of the places of confirmed flowers, with what the hand-eye transform adds."""
+        """Joint covariance (3 k, 3 k) of the places of confirmed flowers.
+
+        With what the hand-eye transform adds, and what all flowers of a cluster have in common that was hardly seen at
+        rest.
+        """
         _, _, cov = self.world.map.solve()
         at = self.world.map.rows(self.world.flowers.ids[rows])
         index = (6 + 3 * at[:, None] + np.arange(3)).ravel()
@@ -239,6 +243,10 @@ class OnlineTracker:
         if self.world.map.is_frozen and self.X is not None:
             lever = self.world.flowers.lever[rows].reshape(-1, 6)
             joint = joint + lever @ self.cov_X @ lever.T
+        slot = self.world.flowers.slot[rows]
+        doubt = np.array([cluster.doubt for cluster in self.world.clusters])[slot]
+        common = np.where(slot[:, None] == slot, doubt[:, None] * doubt, 0.0)
+        joint = joint + np.kron(common, np.eye(3))
         return np.asarray(0.5 * (joint + joint.T) + 1e-14 * np.eye(len(joint)))
 
     def _refusal(self, frame: Frame, reason: str) -> Update:
