@@ -9,18 +9,17 @@ from numpy.typing import NDArray
 from pictures import SEEN, Example
 
 Float32 = NDArray[np.float32]
-_OTHER = 0.4  # share of crops before another backdrop ...
-_PALE = 0.3  # ... and of those with pale things that are no flowers
+_PALE = 0.3  # share of crops with pale things that are no flowers
 
 
 def altered(
-    example: Example, size: int, zoom: tuple[float, float], rng: np.random.Generator
+    example: Example, size: int, zoom: tuple[float, float], rng: np.random.Generator, *, other: float
 ) -> tuple[Float32, NDArray[np.float32]]:
-    """A crop (3, size, size), red green blue, 0..1, and its boxes."""
+    """A crop (3, size, size), red green blue, 0..1, and its boxes; a share ``other`` has another backdrop."""
     image, behind, boxes = _placed(example, size, zoom, rng)
     image, behind, boxes = _turned(image, behind, boxes, rng)
     x = image[:, :, ::-1].astype(np.float32) / 255.0
-    if rng.random() < _OTHER:
+    if rng.random() < other:
         far = cv2.GaussianBlur(behind.astype(np.float32), (0, 0), rng.uniform(0.3, 0.9))[..., None]
         x = x * np.float32(rng.uniform(0.3, 1.1)) if rng.random() < 0.4 else x  # against the light
         x = x * (1 - far) + backdrop(size, rng) * far
