@@ -16,7 +16,6 @@ from cluster_slam.constellation.growth import DAY_S, at, memory_days
 from cluster_slam.constellation.identify import Identities
 from cluster_slam.io.map import open_map
 from cluster_slam.pipeline.remember import add
-from cluster_slam.remember.decide import decide
 from cluster_slam.remember.gauge import frame_covariance
 from cluster_slam.remember.hold import Seen, holding
 from cluster_slam.remember.predict import membership_cov
@@ -94,18 +93,6 @@ def test_the_share_of_flowers_that_are_seen_is_learned(tmp_path: Path) -> None:
     with open_map(tmp_path / "row3.map") as store:
         assert add(store, replace(rest_incoming(plant), constellation=second)).session is not None
         assert 0.45 < learned_seen_share(store.plant("row3"), MapConfig())[0] < 0.75
-
-
-def test_what_was_not_looked_at_for_weeks_may_be_lost(tmp_path: Path) -> None:
-    """The same session against the same plant, 1 and 30 days on: 0.98^30 of the flowers are expected to be left."""
-    plant = SeasonPlant(replace(SEASON, session=SimulateConfig(n_clusters=12)), seed=3)
-    with map_of(tmp_path, plant) as store:
-        known = store.plant("row3")
-    session = rest_incoming(plant).constellation
-    for days in (1.0, 30.0):
-        found = decide(replace(session, start=session.start + days * DAY_S), [known], MapConfig()).matches[0].found
-        assert found is not None
-        np.testing.assert_allclose(found.plant.flower_presence, 0.98**days, rtol=1e-9)
 
 
 def test_flowers_that_come_with_time_are_told_from_those_that_come_at_once(tmp_path: Path) -> None:

@@ -8,13 +8,12 @@ from enum import StrEnum
 
 import numpy as np
 
-from cluster_slam.config import GrowthConfig, MapConfig
-from cluster_slam.constellation.growth import DAY_S, at
+from cluster_slam.config import MapConfig
+from cluster_slam.constellation.growth import at
 from cluster_slam.constellation.match import Match, match
 from cluster_slam.constellation.search import glance
 from cluster_slam.geometry import Array
 from cluster_slam.records import Constellation, PlantMap
-from tracking.presence import persisted
 
 FAMILIAR = 2.0  # log odds of a plant that the map has, before looking: most sessions show one
 REPEATED = 0.5  # a rival that explains more than this share of the best evidence is a clone, or a repeated structure
@@ -59,7 +58,7 @@ def decide(
 ) -> Decision:
     """Match a session with plants as the map holds them, and decide."""
     say = progress or (lambda _stage, _fraction: None)
-    moved = [_expected(plant, session.start, config.growth) for plant in plants]
+    moved = [at(plant, session.start, config.growth) for plant in plants]
     closely = _worth_a_look(session, moved, config, similarity, say)
     matches = []
     for k, plant in enumerate(moved):
@@ -76,13 +75,6 @@ def decide(
         refusal, reason = _other_hand(session, plant, matches[0], config, similarity) or (refusal, reason)
     accepted = matches[0] if refusal is Refusal.NONE and matches else None
     return Decision(matches, probabilities, accepted, refusal, reason)
-
-
-def _expected(plant: PlantMap, time: float, growth: GrowthConfig) -> PlantMap:
-    """The plant at a time, with what was lost since it was last looked at as less likely there."""
-    since = np.maximum(np.nan_to_num(time - plant.flower_last_looked_at) / DAY_S, 0.0)
-    presence = persisted(plant.flower_presence, growth.lost_per_day, since)
-    return replace(at(plant, time, growth), flower_presence=presence)
 
 
 def _is_doubtful(session: Constellation, best: Match, *, alone: bool) -> bool:
