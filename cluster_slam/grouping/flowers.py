@@ -20,7 +20,8 @@ from cluster_slam.grouping.likelihood import Likelihood, members_by_label
 from cluster_slam.grouping.partition import improve, likeliest_cut
 from cluster_slam.records import IntArray
 
-_TOGETHER = 0.62  # share of a flower's frames that show its nearest, too: 0.7 to 0.97 of clusters, 0.37 to 0.55 of none
+_TOGETHER = (0.8, 0.15)  # share of a flower's frames that show its nearest, too, in sessions of clusters: mean, sigma
+_TOGETHER_OF_NONE = (0.45, 0.13)  # in sessions of things that stand alone
 _SURE = 3.0  # log-likelihood, 20 to 1, that flowers move as one
 _LIKELIER = (
     1.0  # as much the likeliest of all partitions gains in one of twelve draws of six flowers that are all loose
@@ -95,17 +96,31 @@ def _tree(places: Array, evidence: csr_matrix | None, method: Literal["single", 
 def _come_in_clusters(places: Array, presence: csr_matrix, label: IntArray, likelihood: Likelihood) -> bool:
     """Whether this session's flowers come in clusters at all.
 
-    They do where they move as one, however seldom they are seen together; and where they are seen together and stand
-    nearer than flowers that are all loose would.
+    They do where they stand nearer than flowers that are all loose would, and are seen together: things that stand in
+    groups, but do not belong together, hide each other or face another way. Where they are seldom seen together they
+    must move as one, the more surely the more seldom.
     """
     clustered = likelihood.sums(members_by_label(label).values())
     if clustered.motion > _SURE:
         return True
     if likelihood.of(clustered) - likelihood(np.arange(len(places))) < _LIKELIER:
         return False
+    doubt = -_of_clusters(_seen_together(places, presence))
+    return doubt <= 0.0 or clustered.motion > doubt
+
+
+def _seen_together(places: Array, presence: csr_matrix) -> float:
+    """Share of a flower's frames that show its nearest, too; the median over flowers."""
     nearest = np.asarray(cKDTree(places).query(places, k=2)[1])[:, 1]
     both = np.asarray(presence.multiply(presence[nearest]).sum(axis=1)).ravel()
     count = np.asarray(presence.sum(axis=1)).ravel()
     # Of the frames that saw the one that is seen less: that one of two is often hidden says nothing of the other.
     together = both / np.maximum(np.minimum(count, count[nearest]), 1)
-    return bool(np.median(together) > _TOGETHER)
+    return float(np.median(together))
+
+
+def _of_clusters(together: float) -> float:
+    """Log-likelihood ratio that flowers come in clusters, by how much of the time neighbours are seen together."""
+    (mean, sigma), (mean_of_none, sigma_of_none) = _TOGETHER, _TOGETHER_OF_NONE
+    ratio = 0.5 * ((together - mean_of_none) / sigma_of_none) ** 2 - 0.5 * ((together - mean) / sigma) ** 2
+    return float(ratio + np.log(sigma_of_none / sigma))
