@@ -277,11 +277,12 @@ def test_flowers_that_move_as_one_come_in_clusters_however_seldom_they_are_seen_
     np.testing.assert_array_equal(together, [0, 0, 0])
 
 
-@pytest.mark.parametrize(("share", "motion", "is_cluster"), [(0.9, 0, True), (0.45, 0, False), (0.45, 1, True)])
-def test_who_is_seen_together_less_must_move_as_one(share: float, motion: float, is_cluster: bool) -> None:
+@pytest.mark.parametrize(("n_hidden", "motion", "is_cluster"), [(1, 0, True), (3, 0, False), (3, 1, True)])
+def test_who_is_seen_together_less_must_move_as_one(n_hidden: int, motion: float, is_cluster: bool) -> None:
     rng = np.random.default_rng(71)
     places = np.array([[0.0, 0, 1], [0.03, 0, 1], [0.0, 0.04, 1]])
-    seen = np.repeat(rng.random((3, N_FRAMES // 10)) < share, 10, axis=1)
+    turn = np.arange(N_FRAMES) // 10 + np.arange(3)[:, None]  # of five, in so many of which each is hidden
+    seen = turn % 5 >= n_hidden
     moved = motion_of(np.zeros(3, dtype=np.int64), 0.01 * motion, rng=rng)
     hidden = Motion(np.where(seen.T[..., None], moved.u, np.nan), np.where(seen.T, moved.var, np.nan), STAMPS)
     found = group_flowers(places, csr_matrix(1.0 * seen), hidden, 0.5, GroupingConfig(), rng=rng)
