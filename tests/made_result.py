@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cluster_slam.geometry import Array, inverse, rotate_cov, se3_exp, transform
+from cluster_slam.geometry import Array, adjoint, inverse, rotate_cov, se3_exp, transform
 from cluster_slam.records import (
     Calibration,
     Clusters,
@@ -57,7 +57,8 @@ def make(
     plant = _plant(rng, stamps - absolute_stamp, n_clusters, sway_m)
     T_flange_camera = se3_exp(np.array([0.02, -0.01, 1.57, 0.01, -0.02, 0.06]))
     true = _camera_path(n_frames)
-    flange = true @ inverse(T_flange_camera) @ se3_exp(rng.normal(size=(n_frames, 6)) * FLANGE_SIGMA)
+    errors = rng.normal(size=(n_frames, 6)) * FLANGE_SIGMA
+    flange = true @ inverse(T_flange_camera) @ se3_exp(errors)
     given = T_flange_camera @ se3_exp(np.array([0.006, -0.005, 0.004, 0.003, -0.002, 0.002]))
     observations, flower_ids = _observe(rng, true, plant)
     session = Session(
@@ -65,7 +66,9 @@ def make(
     )
     cluster_ids = np.where(flower_ids >= 0, plant.cluster_ids[flower_ids], -1)
     truth = Truth(true, flower_ids, cluster_ids, plant.flower_ids, plant.cluster_ids, plant.rest)
-    return Made(session, truth, _result(rng, session, truth, plant, T_flange_camera))
+    # Nobody can tell what all given poses have in common from the mounting.
+    mounting = se3_exp(-errors.mean(axis=0)) @ T_flange_camera
+    return Made(session, truth, _result(rng, session, truth, plant, mounting))
 
 
 def _plant(rng: np.random.Generator, seconds: Array, n_clusters: int, sway_m: float) -> _Plant:
@@ -122,6 +125,8 @@ def _result(rng: np.random.Generator, session: Session, truth: Truth, plant: _Pl
     flowers = _flowers(rng, session, plant, flower_ids)
     clusters = _clusters(session, flowers, cluster_ids)
     xi = rng.normal(size=6) * HAND_EYE_SIGMA
+    A = adjoint(inverse(T_flange_camera))
+    hand_eye_cov = np.diag(HAND_EYE_SIGMA**2) + A @ np.diag(FLANGE_SIGMA**2) @ A.T / session.n_frames
     unsure = rng.normal(size=(session.n_frames, 6)) * CAMERA_SIGMA
     T_world_camera = _camera_path(session.n_frames) @ se3_exp(unsure)
     reasons = np.where(
@@ -143,7 +148,7 @@ def _result(rng: np.random.Generator, session: Session, truth: Truth, plant: _Pl
         flowers,
         clusters,
         _drift(rng, session, plant, clusters, cluster_ids),
-        Calibration(T_flange_camera @ se3_exp(xi), np.diag(HAND_EYE_SIGMA**2)),
+        Calibration(T_flange_camera @ se3_exp(xi), hand_eye_cov),
         Diagnostics(nis, reasons, noise),
         timings_s={"associate": 2.1, "smooth": 0.7},
         counts={"rounds": 2},

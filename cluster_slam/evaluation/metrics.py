@@ -149,7 +149,8 @@ def _hand_eye(metrics: Metrics, result: Result, session: Session, truth: Truth) 
         return metrics
     difference = inverse(true.T_flange_camera) @ result.calibration.T_flange_camera
     xi = se3_log(difference)
-    nees = normalised_squared(xi[None], (result.calibration.cov + true.cov)[None])[0] / 6.0
+    # A truth that is known from the given poses errs by their mean error, and the estimate errs by the same.
+    nees = normalised_squared(xi[None], (result.calibration.cov - true.cov)[None])[0] / 6.0
     return replace(metrics, hand_eye_m=_norm(difference[:3, 3]), hand_eye_rad=_norm(xi[:3]), nees_hand_eye=float(nees))
 
 

@@ -63,7 +63,8 @@ class HandEyeTruth:
     """The true hand-eye transform, and how well it is known."""
 
     T_flange_camera: Array  # (4, 4)
-    cov: Array  # (6, 6) of the tangent on the right; zero where truth states the transform
+    cov: Array  # (6, 6) of the tangent on the right; zero where truth states the transform. Estimates that were made
+    # from the same given poses share this error: all their errors in common look like another mounting.
 
 
 def hand_eye_truth(session: Session, truth: Truth) -> HandEyeTruth | None:
