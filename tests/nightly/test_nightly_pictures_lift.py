@@ -19,7 +19,7 @@ from cluster_slam.simulate.config import MODERATE
 from cluster_slam.simulate.render.frames import Renderer
 from cluster_slam.simulate.session import simulate_session
 
-N_SEEDS = 2
+N_SEEDS = 4
 BINS = (0.15, 0.25, 0.35, 0.45, 0.6, 0.75, 0.9)
 NEAR = (0.16, 0.28, 0.45, 0.6)  # least distance of the camera, m
 SEEN = 0.2  # share of a flower that is seen: less than that no detector finds
@@ -84,4 +84,4 @@ def test_covariances_are_true_at_every_depth(name: str) -> None:
             _say(f"  {low} to {high} m: {len(part)} flowers, ANEES / 3 {part.mean() / 3:.2f}, with all {every:.2f}")
             spread = 3 * np.sqrt(2 / 3 / len(part))
             assert 0.8 - spread < part.mean() / 3 < 1.25 + spread
-    assert wrong.mean() < 0.01
+    assert wrong.mean() < 0.005
