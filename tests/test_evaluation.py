@@ -130,6 +130,14 @@ def test_hand_eye_error_by_hand(made: Made) -> None:
     assert metrics.hand_eye_m == pytest.approx(0.005)
 
 
+def test_a_truth_that_is_less_sure_than_the_estimate_does_not_judge_it(made: Made) -> None:
+    assert made.result.calibration is not None
+    surer = replace(made.result.calibration, cov=1e-12 * np.eye(6))
+    metrics = evaluate(replace(made.result, calibration=surer), made.session, made.truth)
+    assert metrics.nees_hand_eye is None
+    assert metrics.hand_eye_m is not None
+
+
 def test_clutter_scores_by_hand(made: Made) -> None:
     true = made.truth.flower_ids
     assert true is not None

@@ -150,8 +150,10 @@ def _hand_eye(metrics: Metrics, result: Result, session: Session, truth: Truth) 
     difference = inverse(true.T_flange_camera) @ result.calibration.T_flange_camera
     xi = se3_log(difference)
     # A truth that is known from the given poses errs by their mean error, and the estimate errs by the same.
-    nees = normalised_squared(xi[None], (result.calibration.cov - true.cov)[None])[0] / 6.0
-    return replace(metrics, hand_eye_m=_norm(difference[:3, 3]), hand_eye_rad=_norm(xi[:3]), nees_hand_eye=float(nees))
+    # Where the estimate claims to be surer than that, truth cannot judge it.
+    nees = float(normalised_squared(xi[None], (result.calibration.cov - true.cov)[None])[0] / 6.0)
+    judged = nees if np.isfinite(nees) else None
+    return replace(metrics, hand_eye_m=_norm(difference[:3, 3]), hand_eye_rad=_norm(xi[:3]), nees_hand_eye=judged)
 
 
 def _labels(
