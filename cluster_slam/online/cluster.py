@@ -273,8 +273,8 @@ class ClusterTrack:
         if f is None or self.anchor is None:
             return
         x, P = self._hanging(f, self.anchor)
-        if self.is_moving:
-            x[8:11], P[8:11, 8:11] = f.x[8:11], f.P[8:11, 8:11]
+        anew, anew_P = state_at_rest(self.anchor, self.config)
+        x[7], P[7, 7] = anew[7], anew_P[7, 7]  # if it followed others until now, it learned their swing
         x[:3] += d
         if velocity is not None:
             x[3:6] = velocity

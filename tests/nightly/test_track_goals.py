@@ -80,9 +80,11 @@ def test_without_a_calibration_after_ten_seconds(add_row: Tables) -> None:
 
 
 def test_trajectory_and_landmarks_beside_smoothing(add_row: Tables) -> None:
+    """With the calibration that ``smooth`` has found: what another one is off by would shift all flowers."""
     world = simulate_session(PRESETS["moderate"], seed=334)
-    live = evaluate(track(world.session, calibration=calibration_of(world, 334)), world.session, world.truth)
-    later = evaluate(smooth(world.session), world.session, world.truth)
+    smoothed = smooth(world.session)
+    live = evaluate(track(world.session, calibration=smoothed.calibration), world.session, world.truth)
+    later = evaluate(smoothed, world.session, world.truth)
     assert live.ate_rmse_m is not None
     assert later.ate_rmse_m is not None
     assert live.flower_rmse_m is not None
