@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from cluster_slam.association.compatibility import Matches, Side, match_jointly
+from cluster_slam.association.compatibility import Matches, Side, decided_otherwise, match_jointly
 from cluster_slam.geometry import Array, se3_exp, skew
 
 _BASIS = np.eye(6)[:, [1, 3, 5]]
@@ -61,3 +61,15 @@ def test_distances_have_the_variance_along_them() -> None:
     length, var = side.distances()
     assert length[0, 1] == pytest.approx(2.0)
     np.testing.assert_allclose(var[np.triu_indices(3, 1)], 2e-4, rtol=1e-9)
+
+
+def test_each_decision_is_taken_back_once_and_the_rest_made_anew() -> None:
+    a, b = Side(_ALL, _cov(0.01)), Side(_ALL, _cov(0.0))
+    prior = np.diag([0.02, 0.05, 0.05]) ** 2
+    found = match_jointly(a, b, _NOTHING, prior, _BASIS, 5.0)
+    others = decided_otherwise(a, b, [found], prior, _BASIS, 5.0)
+    assert len(others) == len(found.pairs) - 2
+    for k, other in enumerate(others, start=2):
+        np.testing.assert_array_equal(other.pairs[:k], found.pairs[:k])
+        assert found.pairs[k].tolist() not in other.pairs.tolist()
+        assert other.score < found.score

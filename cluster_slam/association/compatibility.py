@@ -60,13 +60,23 @@ class Matches:
     score: float  # twice the log-likelihood ratio to all landmarks being new
 
 
-def match_jointly(a: Side, b: Side, start: Matches, prior: Array, basis: Array, log_volume: float) -> Matches:
+def match_jointly(
+    a: Side,
+    b: Side,
+    start: Matches,
+    prior: Array,
+    basis: Array,
+    log_volume: float,
+    but_not: tuple[int, int] | None = None,
+) -> Matches:
     """Match the landmarks of two sides, ``start`` being given; ``prior`` (d, d) of the motion beside odometry.
 
-    ``log_volume``: log of the space (m^3) in which a new landmark may be found.
+    ``log_volume``: log of the space (m^3) in which a new landmark may be found. ``but_not``: a pair that is not one.
     """
     joint = _Joint(a, b, start.z, prior, basis)
     free = np.ones((len(a.places), len(b.places)), dtype=bool)
+    if but_not is not None:
+        free[but_not] = False
     given, pairs, score = start.pairs.tolist(), [], 0.0
     while free.any():
         chi2, log_det = joint.innovations()
@@ -83,6 +93,21 @@ def match_jointly(a: Side, b: Side, start: Matches, prior: Array, basis: Array, 
         joint.update(i, j)
         free[i], free[:, j] = False, False
     return Matches(np.array(pairs, dtype=np.int64).reshape(-1, 2), joint.z, score)
+
+
+def decided_otherwise(
+    a: Side, b: Side, found: list[Matches], prior: Array, basis: Array, log_volume: float
+) -> list[Matches]:
+    """Matches beside those found: each decision after the first two is taken back once, and the rest made anew.
+
+    What is surest at a time may be wrong, and then all that follows is.
+    """
+    out = []
+    for match in found:
+        for k in range(2, len(match.pairs)):
+            start, pair = Matches(match.pairs[:k], match.z, 0.0), (int(match.pairs[k, 0]), int(match.pairs[k, 1]))
+            out.append(match_jointly(a, b, start, prior, basis, log_volume, pair))
+    return out
 
 
 class _Joint:

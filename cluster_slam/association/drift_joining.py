@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from cluster_slam.association.compatibility import match_jointly
+from cluster_slam.association.compatibility import Matches, decided_otherwise, match_jointly
 from cluster_slam.association.drift_growth import grow
 from cluster_slam.association.drift_labels import State
 from cluster_slam.association.drift_redo import redo, redo_once
@@ -34,6 +34,7 @@ from cluster_slam.geometry import Array
 
 _SAME = 0.98  # of the points have the same landmark: then two maps are one
 _FEW_MERGES = 5  # pairs of landmarks that are tried as one when stretches have been associated again
+_N_RECONSIDERED = 6  # joint matches whose decisions are taken back one by one
 _N_AGAIN = 2  # ways of joining maps in which the stretches of the smaller map are
 
 
@@ -104,17 +105,22 @@ def _ways(session: DriftSession, large: list[Part], small: list[Part]) -> list[P
         for b in small:
             both = sides(a, b, (_place_covs(session, a, b), _place_covs(session, b, a)), steps)
             prior = gap_cov(a, b, steps)
-            seen = set()
-            for start in motions(*both, prior, steps.basis, config.n_motions):
-                match = match_jointly(*both, start, prior, steps.basis, log_volume)
-                key = tuple(sorted(map(tuple, match.pairs.tolist())))
-                if key not in seen:
-                    seen.add(key)
-                    found.append(
-                        (a.cost + b.cost - match.score, identified(joined(a, b, match.z, steps), a, match.pairs))
-                    )
+            starts = motions(*both, prior, steps.basis, config.n_motions)
+            matches = _differing([match_jointly(*both, start, prior, steps.basis, log_volume) for start in starts])
+            others = decided_otherwise(*both, matches[:_N_RECONSIDERED], prior, steps.basis, log_volume)
+            for match in _differing([*matches, *others])[: config.n_ways]:
+                way = identified(joined(a, b, match.z, steps), a, match.pairs)
+                found.append((a.cost + b.cost - match.score, way))
     found.sort(key=lambda way: way[0])
     return [way for _, way in found[: config.n_ways]]
+
+
+def _differing(matches: list[Matches]) -> list[Matches]:
+    """The matches of different landmarks, the likeliest first."""
+    different: dict[tuple[tuple[int, ...], ...], Matches] = {}
+    for match in sorted(matches, key=lambda match: -match.score):
+        different.setdefault(tuple(sorted(map(tuple, match.pairs.tolist()))), match)
+    return list(different.values())
 
 
 def _place_covs(session: DriftSession, part: Part, neighbour: Part) -> Array:
