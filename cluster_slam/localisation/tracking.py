@@ -175,10 +175,7 @@ class Track:
         return covs
 
     def _shake(self, S: Array, V: Array, innovation: Array, flowers: IntArray) -> Array:
-        """Clusters whose points are off together swing: their sway may be as large as that (P grows in place).
-
-        Returns what is added to the variance of each flower's displacement an axis (m,).
-        """
+        """Clusters whose points are off together swing: P grows in place by what is returned (m,), an axis, m^2."""
         clusters, group = np.unique(self.state.marks.cluster[flowers], return_inverse=True)
         m, n = len(flowers), len(clusters)
         information = np.linalg.solve(V, np.broadcast_to(np.eye(3), V.shape))
