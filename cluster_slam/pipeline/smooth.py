@@ -84,6 +84,7 @@ def smooth(
             if joined is not grouped or not same_noise(noise, world.noise):
                 joined = drop_unsupported(stated, joined, config)
                 grouped = learn_errors(stated, stated_poses, joined, noise_stated, config)
+                grouped = let_all_stand(frames, grouped, config)
         world = grouped
         frames, model = for_solving(stated, stated_poses, world)
         smoother, estimate = solve(frames, model, world, config, 2, in_stretches=True)
