@@ -315,3 +315,16 @@ def test_few_flowers_that_stand_anywhere_are_seldom_called_a_cluster() -> None:
 def group_few(places: Array, *, rng: np.random.Generator) -> Array:
     presence = csr_matrix(np.ones((len(places), N_FRAMES)))
     return group_flowers(places, presence, None, 0.15, GroupingConfig(), rng=rng)
+
+
+def test_one_flower_that_moved_apart_is_one_statement() -> None:
+    """Of four flowers one moved apart from each other: as much evidence as where all six pairs are known."""
+    places = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0], [0.0, 0.02, 0.0], [0.0, 0.0, 0.02]])
+    star = np.zeros((4, 4))
+    star[0, 1:] = star[1:, 0] = -2.0
+    known = star.copy()
+    known[1:, 1:] = 1e-12 * (1.0 - np.eye(3))
+    whole = np.zeros(4, dtype=np.int64)
+    of_star, of_all = (Likelihood(places, 1.0, csr_matrix(x)) for x in (star, known))
+    assert of_star(whole) == pytest.approx(of_all(whole))
+    assert of_star.sums([np.arange(4)]).motion == pytest.approx(-3.0)

@@ -3,7 +3,9 @@
 Clusters stand anywhere in a box around the flowers; members scatter about their centroid with one sigma for all
 clusters; the number of members is Poisson, and some flowers are loose. To this comes the evidence of each pair within a
 cluster; of the pairs among n members that pairs tie together at most n - 1 say something new, so that they weigh no
-more than that together. Members of whom no pair is known add nothing to it.
+more than that together. Members of whom no pair is known add nothing to it. One flower that moved apart from k others
+says so beside each of them, but it is one flower: those pairs weigh no more than they do where all pairs of k + 1
+flowers are known.
 
 Neither clusters nor members come in an order: the density of c clusters in a volume V is c! / V^c, and that of n
 members n! times their number's probability (a Neyman-Scott process; Daley and Vere-Jones, "An introduction to the
@@ -130,8 +132,11 @@ class Likelihood:
                 together = together @ together
             of = together.argmax(axis=1)  # the first of those that pairs tie together
         n_tied, n_pairs = np.bincount(of), 0.5 * np.bincount(of, known.sum(axis=1))
-        weight = np.minimum(1.0, (n_tied - 1.0) / np.maximum(n_pairs, 1.0))
-        return float(0.5 * (self.evidence[within].sum(axis=1) * weight[of]).sum())
+        evidence = self.evidence[within]
+        n_apart = 1.0 + (evidence < 0.0).sum(axis=1)
+        weight = np.minimum(1.0, (n_tied - 1.0) / np.maximum(n_pairs, 1.0))[of][:, None]
+        of_one = np.minimum(weight, 2.0 / np.maximum(n_apart[:, None], n_apart))
+        return float(0.5 * (evidence * np.where(evidence < 0.0, of_one, weight)).sum())
 
 
 def members_by_label(label: IntArray) -> dict[int, IntArray]:
