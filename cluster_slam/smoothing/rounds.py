@@ -150,11 +150,11 @@ def regroup(
     at = (frames.frame[used], world.landmark[used])
     u[at] = transform(world.T[frames.frame[used]], frames.points[used]) - world.places[world.landmark[used]]
     var[at] = np.trace(frames.covs[used], axis1=1, axis2=2) / 3.0
+    # Errors that change slowly, of the poses or of the detector, look like motion that flowers have in common.
+    motion = None if world.errs_slowly else Motion(u, var, frames.stamps)
     return replace(
         world,
-        cluster=group_flowers(
-            world.places, presence, Motion(u, var, frames.stamps), view_volume(frames), config.grouping, rng=rng
-        ),
+        cluster=group_flowers(world.places, presence, motion, view_volume(frames), config.grouping, rng=rng),
     )
 
 
