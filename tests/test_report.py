@@ -150,6 +150,15 @@ def test_a_good_result_has_nothing_wrong(made: Made) -> None:
     assert [f for f in found if f.level != "note"] == []
 
 
+def test_noise_that_grows_with_depth_is_told_at_one_metre(made: Made) -> None:
+    found = {"flower": 0.002, "flower_depth": 0.006, "flower_lateral": 0.0016}
+    found |= {"flower_power_depth": 2.0, "flower_power_lateral": 1.0}
+    result = replace(made.result, diagnostics=replace(made.result.diagnostics, estimated_noise=found))
+    rows = {row["key"]: row["name"] for row in page_json(result, None)["noise"]}  # type: ignore[attr-defined]
+    assert set(rows) == {"flower", "flower_depth", "flower_lateral"}
+    assert rows["flower_depth"] == "the depth of a flower 1 m away"
+
+
 def test_what_is_wrong_is_said(made: Made) -> None:
     diagnostics = made.result.diagnostics
     bad = replace(

@@ -147,6 +147,8 @@ NOISE_WORDS = {
     "hand_eye_translation": "the camera's place on the robot",
     "hand_eye_rotation": "the camera's orientation on the robot",
     "flower": "a flower's position in one picture",
+    "flower_depth": "the depth of a flower 1 m away",
+    "flower_lateral": "the place across the view of a flower 1 m away",
     "pixel": "a flower's place in the picture",
     "depth": "the measured depth",
     "sway": "the plant's sway",

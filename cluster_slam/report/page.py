@@ -103,7 +103,8 @@ def _noise(result: Result) -> list[dict[str, object]]:
             "unit": _noise_unit(name),
         }
         for name, value in sorted(result.diagnostics.estimated_noise.items())
-        if not name.endswith("_factor")  # the ratio of the row that it belongs to
+        # A factor is the ratio of the row that it belongs to; a power of depth is no standard deviation.
+        if not name.endswith("_factor") and not name.startswith("flower_power_")
     ]
 
 
