@@ -346,12 +346,12 @@ def batch_system(session: Session, marks: Landmarks, W: Array) -> tuple[Array, A
             h = T[:3, :3].T @ (marks.positions[j] - T[:3, 3])
             skew = np.array([[0, -h[2], h[1]], [h[2], 0, -h[0]], [-h[1], h[0], 0]])
             row = np.zeros((3, n))
-            L = np.linalg.inv(np.linalg.cholesky(session.observations.covs[i]))
-            row[:, 6 + 6 * k : 12 + 6 * k] = L @ np.hstack([skew, -np.eye(3)])
+            L = np.linalg.cholesky(session.observations.covs[i])
+            row[:, 6 + 6 * k : 12 + 6 * k] = np.linalg.solve(L, np.hstack([skew, -np.eye(3)]))
             c = j // 4
-            row[:, 30 + 3 * c : 33 + 3 * c] = row[:, 39 + 3 * j : 42 + 3 * j] = L @ T[:3, :3].T
+            row[:, 30 + 3 * c : 33 + 3 * c] = row[:, 39 + 3 * j : 42 + 3 * j] = np.linalg.solve(L, T[:3, :3].T)
             A.append(row)
-            b.append(L @ (session.observations.points[i] - h))
+            b.append(np.linalg.solve(L, session.observations.points[i] - h))
     for c in range(3):
         row = np.zeros((3, n))
         row[:, 30 + 3 * c : 33 + 3 * c] = np.eye(3) / np.sqrt(marks.shared_covs[c, 0, 0] + 1e-14)

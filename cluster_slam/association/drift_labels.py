@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,20 @@ class State:
     label: IntArray
     places: Array
     cost: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """Labels (m,) and places (l, 3) to try, and a name by which the same trial is known again."""
+
+    label: IntArray
+    places: Array
+    key: tuple[float, ...]
+
+    @staticmethod
+    def of(label: IntArray, places: Array, changed: Array) -> Trial:
+        """Named by where the landmarks stood that are changed, (3,) or (k, 3)."""
+        return Trial(label, places, tuple(np.round(changed.ravel(), 1).tolist()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,24 +151,31 @@ class Labelling:
 
     def merge(self, state: State, price: float, n_tries: int = 12) -> State:
         """Try close landmarks that are hardly ever seen together as one; keep what makes the whole likelier."""
+        return self.improve(state, self._merged, price, n_tries)
+
+    def improve(self, state: State, trials: Callable[[State], Iterable[Trial]], price: float, n_tries: int) -> State:
+        """Take the first of the ``trials`` that makes the whole likelier, and look again, as long as tries last."""
         failed: set[tuple[float, ...]] = set()
         while n_tries > 0:
-            merged = None
-            for a, b in self._merge_candidates(state):
-                key = tuple(np.round(np.concatenate([state.places[a], state.places[b]]), 1).tolist())
-                if key in failed or n_tries <= 0:
+            better = None
+            for trial in trials(state):
+                if trial.key in failed or n_tries <= 0:
                     continue
                 n_tries -= 1
-                label = np.where(state.label == a, b, state.label)
-                trial = self.settle(state.T, label, state.places, price, 2)
-                if trial.cost < state.cost:
-                    merged = trial
+                settled = self.settle(state.T, trial.label, trial.places, price, 2)
+                if settled.cost < state.cost:
+                    better = settled
                     break
-                failed.add(key)
-            if merged is None:
+                failed.add(trial.key)
+            if better is None:
                 break
-            state = merged
+            state = better
         return state
+
+    def _merged(self, state: State) -> Iterator[Trial]:
+        """Pairs of landmarks as one."""
+        for a, b in self._merge_candidates(state):
+            yield Trial.of(np.where(state.label == a, b, state.label), state.places, state.places[[a, b]])
 
     def _merge_candidates(self, state: State) -> list[tuple[int, int]]:
         """Pairs of landmarks (fewer points first), the closest first."""

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from cluster_slam.association.drift_labels import Labelling, State
+from cluster_slam.association.drift_labels import Labelling, State, Trial
 from cluster_slam.association.drift_smoother import DriftSmoother
 from cluster_slam.geometry import Array, rotate_cov, transform
-from cluster_slam.records import BoolArray, IntArray
+from cluster_slam.records import BoolArray
 
 _FEWEST = 4  # points of a landmark that is tried as two
 _LIKELY = 0.4  # of what the choice between the two costs must be saved before poses have adapted
@@ -21,26 +21,11 @@ _N_ROUNDS = 8
 
 def split(labels: Labelling, state: State, price: float, n_tries: int = 8) -> State:
     """Try landmarks as two, those first whose points say so most clearly; keep what makes the whole likelier."""
-    failed: set[tuple[float, ...]] = set()
-    while n_tries > 0:
-        better = None
-        for trial_label, places, key in _candidates(labels, state):
-            if key in failed or n_tries <= 0:
-                continue
-            n_tries -= 1
-            trial = labels.settle(state.T, trial_label, places, price, 2)
-            if trial.cost < state.cost:
-                better = trial
-                break
-            failed.add(key)
-        if better is None:
-            break
-        state = better
-    return state
+    return labels.improve(state, lambda now: _candidates(labels, now), price, n_tries)
 
 
-def _candidates(labels: Labelling, state: State) -> list[tuple[IntArray, Array, tuple[float, ...]]]:
-    """Labels (m,), places (l + 1, 3) and a name for every landmark as two, the clearest gain first."""
+def _candidates(labels: Labelling, state: State) -> list[Trial]:
+    """Every landmark as two, the clearest gain first."""
     smoother = labels.smoother(len(state.T))
     frame, points = smoother.frames.frame, smoother.frames.points
     world = transform(state.T[frame], points)
@@ -59,7 +44,7 @@ def _candidates(labels: Labelling, state: State) -> list[tuple[IntArray, Array, 
         places[j] = pair[0]
         choice = _choice_cost(float(second.mean()), len(rows))
         if gain > _LIKELY * choice:
-            found.append((gain - choice, (label, places, tuple(np.round(state.places[j], 1).tolist()))))
+            found.append((gain - choice, Trial.of(label, places, state.places[j])))
     return [candidate for _, candidate in sorted(found, key=lambda item: -item[0])]
 
 

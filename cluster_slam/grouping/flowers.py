@@ -23,9 +23,7 @@ from cluster_slam.records import IntArray
 _TOGETHER = (0.8, 0.15)  # share of a flower's frames that show its nearest, too, in sessions of clusters: mean, sigma
 _TOGETHER_OF_NONE = (0.45, 0.13)  # in sessions of things that stand alone
 _SURE = 3.0  # log-likelihood, 20 to 1, that flowers move as one
-_LIKELIER = (
-    1.0  # as much the likeliest of all partitions gains in one of twelve draws of six flowers that are all loose
-)
+_LIKELIER = 1.0  # log-likelihood: six flowers that are all loose gain as much by chance in one of twelve draws
 _REACH = 7.0  # spacings; flowers that far apart are of two clusters, whatever they do
 
 

@@ -40,9 +40,9 @@ class State:
     W: Array  # (4, 4) T_map_world
     X: Array | None  # (4, 4) T_flange_camera
     P: Array
-    d: Array = field(default_factory=lambda: np.zeros(0))  # (d,) of b, s and f at their columns; zero before
-    cluster_at: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # (c,) column of b; s follows
-    flower_at: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # (f,) column of f
+    d: Array = field(init=False)  # (d,) of b, s and f at their columns; zero before
+    cluster_at: IntArray = field(init=False)  # (c,) column of b; s follows
+    flower_at: IntArray = field(init=False)  # (f,) column of f
 
     def __post_init__(self) -> None:
         self.d = np.zeros(len(self.P))

@@ -13,7 +13,7 @@ from cluster_slam.config import SmoothConfig
 from cluster_slam.graph.noise import pose_model
 from cluster_slam.graph.poses import PoseModel
 from cluster_slam.records import Result, Session
-from cluster_slam.smoothing.again import follow_joined, learn_errors, same_noise
+from cluster_slam.smoothing.again import follow_joined, same_noise, settle_again
 from cluster_slam.smoothing.finish import make_result
 from cluster_slam.smoothing.first import first_world
 from cluster_slam.smoothing.rounds import (
@@ -80,11 +80,9 @@ def smooth(
         if i > 0 and same_groups(world, grouped):
             break
         if i == 0 and not drifts:
-            joined = follow_joined(frames, model, grouped, world.cluster, config)
-            if joined is not grouped or not same_noise(noise, world.noise):
-                joined = drop_unsupported(stated, joined, config)
-                grouped = learn_errors(stated, stated_poses, joined, noise_stated, config)
-                grouped = let_all_stand(frames, grouped, config)
+            followed = follow_joined(frames, model, grouped, world.cluster, config)
+            if followed is not grouped or not same_noise(noise, world.noise):
+                grouped = settle_again(stated, stated_poses, followed, noise_stated, config)
         world = grouped
         frames, model = for_solving(stated, stated_poses, world)
         smoother, estimate = solve(frames, model, world, config, 2, in_stretches=True)

@@ -15,7 +15,7 @@ from cluster_slam.config import SmoothConfig
 from cluster_slam.graph.poses import PoseModel
 from cluster_slam.graph.variance import VarianceFactors
 from cluster_slam.records import BoolArray, IntArray
-from cluster_slam.smoothing.rounds import followed, solve
+from cluster_slam.smoothing.rounds import drop_unsupported, followed, let_all_stand, solve
 from cluster_slam.smoothing.world import World, for_solving, learn
 
 _SAME = 0.1  # of a variance: sigmas to 5 %
@@ -52,18 +52,18 @@ def follow_joined(
     return replace(world, landmark=landmark)
 
 
-def learn_errors(
+def settle_again(
     stated: Frames, stated_poses: PoseModel, world: World, noise: VarianceFactors, config: SmoothConfig
 ) -> World:
-    """Learn anew, from ``noise``, how large the errors are, until that does not change."""
-    world = replace(world, noise=noise)
+    """Leave out what is no longer supported, and learn anew, from ``noise``, how large the errors are."""
+    world = replace(drop_unsupported(stated, world, config), noise=noise)
     for _ in range(config.max_rounds):
         before = world.noise
         frames, model = for_solving(stated, stated_poses, world)
         world = learn(world, *solve(frames, model, world, config, 2))
         if same_noise(before, world.noise):
             break
-    return world
+    return let_all_stand(stated, world, config)
 
 
 def same_noise(a: VarianceFactors, b: VarianceFactors) -> bool:
