@@ -249,6 +249,15 @@ class Constellation:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """Flowers of a plant as its sessions saw them, in the order of the sessions."""
+
+    flower_ids: IntArray  # (n,) persistent ids
+    sessions: IntArray  # (n,) from 0, in the order in which the plant's sessions came
+    session_times: Array  # (s,) s, NaN where unknown
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PlantMap:
     """One plant of a map in the plant's own frame, with persistent ids.
 
@@ -286,6 +295,7 @@ class PlantMap:
     last_session: float = float("nan")  # s, end of the latest session
     drift_rate: float = 0.003  # m/day, RMS norm of the drift of a cluster, as learned so far
     walk_rate: float = 0.0007  # m/sqrt(day), one sigma an axis of a cluster's random walk, as learned so far
+    sightings: Sightings | None = None  # None: of each flower the first and the last one are known
 
     @property
     def flower_rows(self) -> IntArray:

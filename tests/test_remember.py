@@ -15,8 +15,11 @@ from cluster_slam.constellation.fit import Pairs, pose_covariance
 from cluster_slam.constellation.growth import DAY_S, at, memory_days
 from cluster_slam.constellation.identify import Identities
 from cluster_slam.io.map import open_map
+from cluster_slam.io.map.store import MapStore
 from cluster_slam.pipeline.remember import add
+from cluster_slam.records import Sightings
 from cluster_slam.remember.gauge import frame_covariance
+from cluster_slam.remember.history import hidden_looks, history_of
 from cluster_slam.remember.hold import Seen, holding
 from cluster_slam.remember.predict import membership_cov
 from cluster_slam.remember.seen import PRIOR_SURPRISES, Habits, habits_of, learned_seen_share, scattered
@@ -80,19 +83,65 @@ def test_ellipsoids_hold_what_a_gaussian_would_not() -> None:
     assert np.sqrt(7.815 * held[3][0, 0]) > 0.03  # either of two is seen in two thirds
 
 
+def learned(store: MapStore) -> tuple[float, float]:
+    plant = store.plant("row3")
+    return learned_seen_share(plant, history_of(plant), MapConfig())
+
+
 def test_the_share_of_flowers_that_are_seen_is_learned(tmp_path: Path) -> None:
     """Half of the flowers are hidden the second time: from a prior of 0.85 towards a half."""
     config = replace(SEASON, session=SimulateConfig(n_clusters=12))
     plant = SeasonPlant(config, seed=3)
     with map_of(tmp_path, plant) as store:
-        assert learned_seen_share(store.plant("row3"), MapConfig()) == (0.85, 10.0)
+        assert learned(store) == (0.85, 10.0)
     hidden = SeasonPlant(replace(config, unseen_share=0.5), seed=3)
     hidden.grow_to(0.0)
     second = rest_incoming(hidden).constellation
     second = replace(second, session="second", start=second.start + DAY_S, end=second.end + DAY_S)
     with open_map(tmp_path / "row3.map") as store:
         assert add(store, replace(rest_incoming(plant), constellation=second)).session is not None
-        assert 0.45 < learned_seen_share(store.plant("row3"), MapConfig())[0] < 0.75
+        assert 0.45 < learned(store)[0] < 0.75
+
+
+def test_looks_in_vain_are_counted_as_often_as_there_were_any() -> None:
+    """Three of a cluster, five sessions: who was seen, beside whom, and how many looks a lost one was hidden in."""
+    plant = plant_of(SeasonPlant(replace(SEASON, session=SimulateConfig(n_clusters=12)), seed=3).rest().constellation)
+    mine = np.flatnonzero(plant.flower_rows == 1)[:3]
+    assert len(mine) == 3
+    looks = {0: (0, 1, 3, 4), 1: (0,), 2: (1, 2)}  # of each flower the sessions; the third session saw one alone
+    told = [(int(plant.flower_ids[mine[k]]), s) for k, seen in looks.items() for s in seen]
+    ids, sessions = np.array(told).T
+    times = 1e9 + DAY_S * np.array([0.0, 1.0, 2.0, 4.0, np.nan])  # that one has no date changes nothing
+    history = history_of(replace(plant, sightings=Sightings(ids, sessions, times)))
+    np.testing.assert_array_equal(history.counts[1], [2, 2, 1, 1, 1])
+    np.testing.assert_array_equal(history.newcomers[1], [2, 1, 0, 0, 0])
+    np.testing.assert_array_equal(history.first[mine], [0, 0, 1])
+    np.testing.assert_array_equal(history.last[mine], [4, 0, 2])
+    np.testing.assert_array_equal(history.beside[mine[0]], [True, True, True, False, False])
+    np.testing.assert_array_equal(history.days, [0.0, 1.0, 2.0, 4.0, 4.0])
+    found = hidden_looks(history, np.full(len(plant.flower_ids), 0.9), 0.8, 0.1)[mine]
+    # the second: looks after 1, 2, 4 and 4 days; lost in between, or hidden each time
+    there = 0.9 * np.array([1.0, 0.2 * 0.9, 0.2**2 * 0.9**2, 0.2**3 * 0.9**4, 0.2**4 * 0.9**4])
+    lost = 0.9 * np.array([0.1, 0.2 * 0.9 * 0.1, 0.2**2 * (0.9**2 - 0.9**4), 0.0])
+    expected = (lost @ np.arange(4) + 4 * there[4]) / (0.1 + lost.sum() + there[4])
+    np.testing.assert_allclose(found[:2], [0.0, expected], rtol=1e-12)
+
+
+def test_a_map_tells_all_sightings(tmp_path: Path) -> None:
+    """As many as were stored, and habits learned from all of them: nobody hidden in three sessions."""
+    plant = SeasonPlant(replace(SEASON, session=SimulateConfig(n_clusters=12)), seed=3)
+    with map_of(tmp_path, plant) as store:
+        for day in (1.0, 3.0):
+            plant.grow_to(day)
+            assert add(store, rest_incoming(plant)).session is not None
+        known = store.plant("row3")
+        told = known.sightings
+        assert told is not None
+        n = store.read("SELECT session_id, count(*) FROM flower_observations GROUP BY session_id ORDER BY session_id")
+        np.testing.assert_array_equal(np.bincount(told.sessions), [count for _, count in n])
+        np.testing.assert_array_equal(told.session_times, [s.start for s in store.sessions()])
+        assert learned(store)[0] > 0.97
+        assert learned_seen_share(known, history_of(replace(known, sightings=None)), MapConfig())[0] > 0.95
 
 
 def test_flowers_that_come_with_time_are_told_from_those_that_come_at_once(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ def predict_plant(plant: PlantMap, time: float, config: MapConfig) -> tuple[Plan
     habits = habits_of(plant, config)
     since = np.maximum(np.nan_to_num(time - plant.flower_last_looked_at) / DAY_S, 0.0)
     share = habits.share * persisted(moved.flower_presence, config.growth.lost_per_day, since)
-    share = share * is_real(plant, config.match.ghosts)
+    share = share * is_real(plant, habits.at_once * config.match.ghosts)
     weight = np.maximum(np.bincount(row, share, n), 1e-12)
     centres = np.stack([np.bincount(row, share * x, n) for x in moved.flowers.T], axis=1) / weight[:, None]
     offsets = moved.flowers - centres[row]

@@ -10,7 +10,7 @@ from cluster_slam.config import MapConfig
 from cluster_slam.constellation.growth import DAY_S, gaps
 from cluster_slam.geometry import Array
 from cluster_slam.records import PlantMap
-from tracking.presence import persisted
+from cluster_slam.remember.history import History, hidden_looks, history_of
 
 PRIOR_LOOKS = 10.0  # the prior share of flowers that a session sees counts as so many looks
 PRIOR_SURPRISES = 5.0  # flowers that nobody knew: what is expected of them counts as so many
@@ -31,24 +31,24 @@ class Habits:
 
 def habits_of(plant: PlantMap, config: MapConfig) -> Habits:
     """What a session of the plant sees, as far as is known."""
-    share, looks = learned_seen_share(plant, config)
-    return Habits(share, looks, *_surprise(plant, share, config))
+    history = history_of(plant)
+    share, looks = learned_seen_share(plant, history, config)
+    return Habits(share, looks, *_surprise(history, share, config))
 
 
-def learned_seen_share(plant: PlantMap, config: MapConfig) -> tuple[float, float]:
-    """Share of the flowers that a session sees, and how many flowers tell: whose cluster was seen at least twice.
+def learned_seen_share(plant: PlantMap, history: History, config: MapConfig) -> tuple[float, float]:
+    """Share of the flowers that a session sees, and how many looks tell: at flowers beside which others were seen.
 
-    One that did not come back was hidden, or lost, or false from the beginning (expectation maximisation).
+    One that was seen again later was there in between. One that did not come back was hidden each time, or lost, or
+    false from the beginning (expectation maximisation).
     """
-    row, share = plant.flower_rows, config.match.seen_share
-    again = plant.flower_first_seen < plant.cluster_last_seen[row]
-    missed = again & (plant.flower_last_seen < plant.cluster_last_seen[row])
-    hits = float((again & ~missed).sum())
-    days = np.nan_to_num(plant.cluster_last_seen[row] - plant.flower_last_seen)[missed] / DAY_S
-    there = persisted(is_real(plant, config.match.ghosts)[missed], config.growth.lost_per_day, days)
-    prior, hidden = share, 0.0
+    sessions, prior = np.arange(len(history.days)), config.match.seen_share
+    there = history.beside & (sessions > history.first[:, None]) & (sessions <= history.last[:, None])
+    hits = float((there & history.seen).sum())
+    missed = float((there & ~history.seen).sum())
+    real, share, hidden = is_real(plant, config.match.ghosts), prior, 0.0
     for _ in range(N_ROUNDS):
-        hidden = float((there * (1.0 - share) / (1.0 - there * share)).sum())
+        hidden = missed + float(hidden_looks(history, real, share, config.growth.lost_per_day).sum())
         share = min((PRIOR_LOOKS * prior + hits) / (PRIOR_LOOKS + hits + hidden), 0.999)
     return share, PRIOR_LOOKS + hits + hidden
 
@@ -87,23 +87,22 @@ def _hidden(seen: Array, looks: Array, share: float) -> Array:
     return hidden
 
 
-def _surprise(plant: PlantMap, share: float, config: MapConfig) -> tuple[float, float, float]:
-    """Factors of what nobody knew when clusters were last seen, at once and since, and how many flowers tell.
+def _surprise(history: History, share: float, config: MapConfig) -> tuple[float, float, float]:
+    """Factors of what nobody knew of a cluster before a session, at once and since, and how many flowers tell.
 
     Flowers that were hidden or are false come with a look, new ones with time. Which of them one was cannot be told:
     each counts for both, by what is expected of them (expectation maximisation).
     """
-    row, last = plant.flower_rows, plant.cluster_last_seen
-    sessions = np.unique(plant.flower_first_seen)
-    before = sessions[np.maximum(np.searchsorted(sessions, last) - 1, 0)] if len(sessions) else last
-    again = plant.cluster_first_seen < last
-    is_new = plant.flower_first_seen == last[row]
-    found = float(is_new[again[row]].sum())
-    seen: Array = np.asarray(share * np.bincount(row, ~is_new * plant.flower_presence, len(last)), dtype=np.float64)
-    looks: Array = np.where(before > plant.cluster_first_seen, 2.0, 1.0)
-    days = np.nan_to_num(last - np.maximum(before, plant.cluster_first_seen)) / DAY_S
-    at_once = float((_hidden(seen, looks, share) + config.match.ghosts)[again].sum())
-    since = float((seen * config.growth.new_per_day * days)[again].sum())
+    is_seen, newcomers = history.counts > 0, history.newcomers
+    looks = np.cumsum(is_seen, axis=1)
+    cluster, session = np.nonzero(is_seen & (looks > 1))
+    latest = np.maximum.accumulate(np.where(is_seen, np.arange(len(history.days)), 0), axis=1)
+    days = history.days[session] - history.days[latest[cluster, session - 1]]
+    found = float(newcomers[cluster, session].sum())
+    seen: Array = np.asarray(history.counts - newcomers, dtype=np.float64)[cluster, session]
+    so_far: Array = np.minimum(looks[cluster, session] - 1.0, 2.0)
+    at_once = float((_hidden(seen, so_far, share) + config.match.ghosts).sum())
+    since = float((seen * config.growth.new_per_day * days).sum())
     a = b = 1.0
     for _ in range(N_ROUNDS):
         part = a * at_once / max(a * at_once + b * since, 1e-12)

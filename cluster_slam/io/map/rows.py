@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from cluster_slam.geometry import Array
-from cluster_slam.records import PlantMap
+from cluster_slam.records import PlantMap, Sightings
 
 _UPPER = np.triu_indices(3)
 _FULL = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
@@ -17,7 +17,9 @@ N_FLOWER_COLUMNS = 15
 Row = tuple[Any, ...]
 
 
-def plant_from_rows(plant: Row, clusters: Sequence[Row], flowers: Sequence[Row], last: float | None) -> PlantMap:
+def plant_from_rows(
+    plant: Row, clusters: Sequence[Row], flowers: Sequence[Row], last: float | None, sightings: Sightings
+) -> PlantMap:
     """A plant of its row in ``plants`` and its rows in ``clusters`` and ``flowers``, in the order of the schema."""
     c = _numbers(clusters, N_CLUSTER_COLUMNS)
     f = _numbers(flowers, N_FLOWER_COLUMNS)
@@ -52,7 +54,16 @@ def plant_from_rows(plant: Row, clusters: Sequence[Row], flowers: Sequence[Row],
         last_session=float("nan") if last is None else last,
         drift_rate=plant[5],
         walk_rate=plant[6],
+        sightings=sightings,
     )
+
+
+def sightings_from_rows(sessions: Sequence[Row], seen: Sequence[Row]) -> Sightings:
+    """Sightings of ``id, time`` of a plant's sessions and ``flower, session`` of each, both in the order of time."""
+    ids = np.array([row[0] for row in sessions], dtype=np.int64)
+    pairs = np.array(seen, dtype=np.int64).reshape(-1, 2)
+    times = np.array([row[1] for row in sessions], dtype=float)
+    return Sightings(pairs[:, 0], np.searchsorted(ids, pairs[:, 1]).astype(np.int64), times)
 
 
 def cluster_rows(plant: PlantMap, plant_id: int) -> list[Row]:

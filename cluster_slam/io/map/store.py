@@ -17,8 +17,8 @@ from cluster_slam.errors import InputError, OutputError
 from cluster_slam.geometry import Array, pose_from_tum
 from cluster_slam.io.map import schema
 from cluster_slam.io.map.header import check_file
-from cluster_slam.io.map.rows import Row, plant_from_rows
-from cluster_slam.records import PlantMap
+from cluster_slam.io.map.rows import Row, plant_from_rows, sightings_from_rows
+from cluster_slam.records import PlantMap, Sightings
 
 BUSY_S = 5.0  # so long a writer waits for another
 
@@ -108,7 +108,19 @@ class MapStore:
             (plant_id,),
         )
         last = self.read("SELECT max(end) FROM sessions WHERE plant_id = ?", (plant_id,))[0][0]
-        return plant_from_rows(found[0], clusters, flowers, last)
+        return plant_from_rows(found[0], clusters, flowers, last, self._sightings(plant_id))
+
+    def _sightings(self, plant_id: int) -> Sightings:
+        """Which session saw which flowers of a plant."""
+        sessions = self.read(
+            "SELECT id, coalesce(start, end) FROM sessions WHERE plant_id = ? ORDER BY id", (plant_id,)
+        )
+        seen = self.read(
+            "SELECT o.flower_id, o.session_id FROM sessions s JOIN flower_observations o ON o.session_id = s.id "
+            "WHERE s.plant_id = ? AND o.local_id IS NOT NULL ORDER BY o.session_id, o.flower_id",
+            (plant_id,),
+        )
+        return sightings_from_rows(sessions, seen)
 
     def plants(self) -> list[PlantMap]:
         """All plants, in the order in which they came."""
