@@ -548,12 +548,30 @@ def test_two_plants_cannot_be_told_apart(tmp_path: Path) -> None:
     plant = grown()
     with map_of(tmp_path, plant, "a") as store:
         twin = replace(rest_incoming(grown()).constellation, session="twin")
-        add(store, replace(rest_incoming(grown()), constellation=twin), plant="b")
+        founded = add(store, replace(rest_incoming(grown()), constellation=twin), plant="b")
+        assert founded.also_fits == ("a",)
         plant.grow_to(2.0)
         refused = add(store, rest_incoming(plant))
         assert refused.session is None
         assert "ambiguous" in refused.decision.reason
+        assert "one plant twice, or do they overlap" in refused.decision.reason
+        assert refused.decision.fits == ("a", "b")
         assert add(store, rest_incoming(plant), plant="a").session is not None
+
+
+def test_a_plant_that_shows_another_ones_flowers_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Founded under a name of its own, from flowers that the map has: a warning; another plant: none."""
+    path = str(tmp_path / "m.map")
+    assert run(["map", "create", path, "--quiet"]) == 0
+    for name, seed, day in (("a", 0, 0.0), ("b", 0, 1.0), ("c", 1, 0.0)):
+        result = str(result_of(tmp_path / name, grown(seed, day)))
+        assert run(["map", "add", path, result, "--plant", name]) == 0
+        said = capsys.readouterr().err
+        assert ("fits a as well: it and b may be one plant, or overlap" in said) == (name == "b")
+    plant = str(result_of(tmp_path / "d", grown(1, 2.0)))
+    assert run(["map", "add", path, plant, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["plant"], told["also_fits"]) == ("c", [])
 
 
 def test_reading_a_result_needs_a_result(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ REPEATED = 0.5  # a rival that explains more than this share of the best evidenc
 HALF = 0.5  # of the session's flowers: where fewer found a partner, its mirror image is tried
 OTHER_UNIT = 4.0  # a plant that is so many times as large, or small, as the map's is given in another unit
 N_CLOSE = 6  # plants that are matched in full where the map has many ...
+TWICE = " (one plant twice, or do they overlap? --plant says which)"
 COMES_NEAR = 0.3  # ... the best two at a glance, and those that reach this share of the best one's score
 
 
@@ -41,6 +42,7 @@ class Decision:
     accepted: Match | None
     refusal: Refusal
     reason: str  # for a person
+    fits: tuple[str, ...]  # plants that fit well enough, best first: more than one where plants overlap
 
     @property
     def probability(self) -> float:
@@ -74,7 +76,8 @@ def decide(
         plant = next(p for p in moved if p.name == matches[0].name)
         refusal, reason = _other_hand(session, plant, matches[0], config, similarity) or (refusal, reason)
     accepted = matches[0] if refusal is Refusal.NONE and matches else None
-    return Decision(matches, probabilities, accepted, refusal, reason)
+    fits = tuple(m.name for m in matches if m.evidence >= _wanted(config, len(matches)))
+    return Decision(matches, probabilities, accepted, refusal, reason, fits)
 
 
 def _is_doubtful(session: Constellation, best: Match, *, alone: bool) -> bool:
@@ -131,13 +134,18 @@ def _probabilities(matches: list[Match]) -> Array:
     return posterior
 
 
+def _wanted(config: MapConfig, n: int) -> float:
+    """Log of the Bayes factor at which one of n plants is believed."""
+    return config.match.evidence + float(np.log(n))
+
+
 def _refusal(
     session: Constellation, plants: Sequence[PlantMap], matches: list[Match], config: MapConfig
 ) -> tuple[Refusal, str]:
     if not matches:
         return Refusal.NO_MATCH, "the map has no plant to align with"
     best, options = matches[0], config.match
-    wanted = options.evidence + np.log(len(matches))
+    wanted = _wanted(config, len(matches))
     n = min(len(session.flowers), max(len(p.flowers) for p in plants))
     if n < 3:
         return Refusal.TOO_FEW, f"too few flowers ({n}) to align by, at least 3 are needed"
@@ -149,7 +157,8 @@ def _refusal(
         return Refusal.NONE, fits
     if best.evidence >= wanted:
         text = f"ambiguous: {fits}, {rival} with {score:.1f}; they must differ by {margin:.1f}"
-        return Refusal.AMBIGUOUS, text
+        is_other = score >= wanted and rival in {m.name for m in matches[1:]}
+        return Refusal.AMBIGUOUS, text + (TWICE if is_other else "")
     if best.is_repeated:
         text = f"ambiguous: the clusters' layout fits {best.name} in several ways, and their flowers none well"
         return Refusal.AMBIGUOUS, f"{text} ({best.evidence:.1f}, wanted {wanted:.1f})"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cluster_slam.cli.map.options import AlignOption, MapArgument, is_similarity, opened
-from cluster_slam.cli.map.told import added_json, tell_added, tell_completed
+from cluster_slam.cli.map.told import added_json, overlap, tell_added, tell_completed
 from cluster_slam.cli.options import ConfigOption, JsonOption, QuietOption, SetOption, configured
 from cluster_slam.cli.progress import StageProgress
 from cluster_slam.cli.summary import print_json, print_warnings
@@ -87,7 +87,7 @@ def add(
     if as_json:
         print_json(added_json(added))
     elif not quiet:
-        print_warnings(incoming.warnings)
+        print_warnings([*incoming.warnings, *overlap(added)])
         tell_added(added, incoming, perf_counter() - started)
     if added.session is None:
         print_warnings([f"refused, the map is unchanged: {added.decision.reason}"])

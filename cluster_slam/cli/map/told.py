@@ -35,6 +35,7 @@ def added_json(added: Added) -> dict[str, object]:
         "T_map_world": tum_from_pose(added.session.T_map_world).tolist(),
         "clusters": {"known": added.n_known, "new": added.n_new, "missed": added.n_missed},
         "flowers": {"known": added.n_flowers_known, "new": added.n_flowers_new},
+        "also_fits": list(added.also_fits),
     }
 
 
@@ -50,6 +51,15 @@ def tell_added(added: Added, incoming: Incoming, seconds: float) -> None:
         ("time", f"{seconds:.1f} s"),
     ]
     print_columns("cluster-slam map add", (), rows)
+
+
+def overlap(added: Added) -> list[str]:
+    """A warning where the session fits another plant of the map, too."""
+    if not added.also_fits:
+        return []
+    plant = "" if added.session is None else added.session.plant
+    text = f"fits {', '.join(added.also_fits)} as well: it and {plant} may be one plant, or overlap"
+    return [f"{text}; flowers that both have are remembered twice"]
 
 
 def _alignment(added: Added, incoming: Incoming) -> str:
