@@ -7,6 +7,7 @@ import numpy as np
 from cluster_slam.association.frames import sort_by_frame
 from cluster_slam.config import SmoothConfig
 from cluster_slam.evaluation.trajectory import hand_eye_truth
+from cluster_slam.graph.innovations import squared_innovations
 from cluster_slam.graph.noise import pose_model
 from cluster_slam.graph.variance import VarianceFactors
 from cluster_slam.records import Result, Session, Truth
@@ -40,7 +41,8 @@ def smooth_with_truth(session: Session, truth: Truth, config: SmoothConfig | Non
         world = learn(world, smoother, estimate)
     say_how_sure(smoother, stated, stated_poses, world)
     marginals = smoother.marginals(estimate)
-    return make_result(session, frames, world, smoother, estimate, marginals, config, 0, [], {})
+    nis = squared_innovations(smoother, estimate)
+    return make_result(session, frames, world, smoother, estimate, marginals, nis, config, 0, [], {})
 
 
 def _true_landmarks(truth: Truth, order: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -77,10 +77,19 @@ class BatchSmoother:
     """Gauss-Newton on the whole session with the association given."""
 
     def __init__(
-        self, frames: Frames, poses: PoseModel, landmark: IntArray, pairs: Pairs, correlation: float = 1.0
+        self,
+        frames: Frames,
+        poses: PoseModel,
+        landmark: IntArray,
+        pairs: Pairs,
+        correlation: float = 1.0,
+        tied: Array | None = None,
     ) -> None:
-        """``landmark`` (m,) flower of each sorted observation or -1; ``correlation`` observations count as one."""
-        self.correlation = correlation
+        """``landmark`` (m,) flower of each sorted observation or -1; ``correlation`` observations count as one.
+
+        ``tied`` (3 l, 3 l): information that places have of each other.
+        """
+        self.correlation, self.tied = correlation, tied
         self.frames, self.poses, self.pairs = frames, poses, pairs
         rows = np.flatnonzero(landmark >= 0)
         self.rows = rows[np.lexsort((pairs.of[rows], frames.frame[rows]))]
@@ -145,7 +154,8 @@ class BatchSmoother:
         ``in_gtsam``: by eliminating the whole factor graph, where the closed form would do, too.
         """
         # odometry ties each pose to the next: the closed form knows no such chain
-        way = whole if in_gtsam or self.poses.cov_step is not None else elimination
+        alone = self.poses.cov_step is None and self.tied is None
+        way = whole if self.poses.cov_step is not None or (in_gtsam and alone) else elimination
         try:
             by = way.solve_step(self.links, self.linearised(e))
         except (RuntimeError, np.linalg.LinAlgError) as error:  # their words for it are no answer to a person
@@ -184,6 +194,8 @@ class BatchSmoother:
             x_information=prior.x_information,
             x_vector=prior.x_vector,
             place_information=_WEAK**2,
+            tied=self.tied,
+            tied_vector=None if self.tied is None else -self.tied @ e.places.ravel(),
         )
 
     def _with_residuals(self, e: Estimate) -> Estimate:

@@ -70,6 +70,9 @@ class _Elimination:
         S, fronts = self._stretches()
         n = 3 * self.links.n_places
         S[:n, :n] += self.at.place_information * np.eye(n)
+        if self.at.tied is not None and self.at.tied_vector is not None:
+            S[:n, :n] += self.at.tied
+            S[:n, -1] += self.at.tied_vector
         S[n:-1, n:-1] += self.at.x_information
         S[n:-1, -1] += self.at.x_vector
         return S, fronts

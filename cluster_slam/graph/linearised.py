@@ -40,6 +40,8 @@ class Linearised:
     x_information: Array  # (k, k)
     x_vector: Array  # (k,)
     place_information: float
+    tied: Array | None = None  # (3 l, 3 l) information of places with each other ...
+    tied_vector: Array | None = None  # (3 l,) ... and its vector
 
 
 @dataclass(frozen=True, slots=True, eq=False)

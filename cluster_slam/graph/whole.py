@@ -48,8 +48,10 @@ def remaining(links: Links, at: Linearised) -> Array:
     """Information (3 l + k, 3 l + k) of places and hand-eye transform, all else eliminated."""
     keys = _Keys(links, len(at.x_vector))
     _, rest = whole_graph(links, at).eliminatePartialMultifrontal(_in_order(_of_frames(links, keys)))
-    H, _ = rest.hessian(_in_order(range(keys.l, keys.end)))
-    return np.asarray(H)
+    H = np.array(rest.hessian(_in_order(range(keys.l, keys.end)))[0])
+    if at.tied is not None:
+        H[: len(at.tied), : len(at.tied)] += at.tied
+    return H
 
 
 def whole_graph(links: Links, at: Linearised) -> gtsam.GaussianFactorGraph:

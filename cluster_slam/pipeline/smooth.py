@@ -10,12 +10,14 @@ import numpy as np
 
 from cluster_slam.association.frames import Frames, sort_by_frame
 from cluster_slam.config import SmoothConfig
+from cluster_slam.graph.innovations import squared_innovations
 from cluster_slam.graph.noise import pose_model
 from cluster_slam.graph.poses import PoseModel
 from cluster_slam.records import Result, Session
 from cluster_slam.smoothing.again import follow_joined, same_noise, settle_again
 from cluster_slam.smoothing.finish import make_result
 from cluster_slam.smoothing.first import first_world
+from cluster_slam.smoothing.looks import solve_in_looks
 from cluster_slam.smoothing.rounds import (
     associate,
     drop_unsupported,
@@ -87,11 +89,20 @@ def smooth(
         frames, model = for_solving(stated, stated_poses, world)
         smoother, estimate = solve(frames, model, world, config, 2, in_stretches=True)
         world = learn(world, smoother, estimate)
+    in_looks = None
+    if not drifts and not world.errs_slowly:
+        in_looks = solve_in_looks(stated, stated_poses, world, estimate, config)
+    if in_looks is not None:
+        smoother, estimate = in_looks.smoother, in_looks.estimate
     estimate, _ = smoother.step(estimate, in_gtsam=True)
-    say_how_sure(smoother, stated, stated_poses, world)
-    marginals = with_unknown_scale(smoother.marginals(estimate), estimate, world.instruments, session.noise)
+    say_how_sure(smoother, stated, stated_poses, world if in_looks is None else in_looks.world)
+    marginals, nis = smoother.marginals(estimate), squared_innovations(smoother, estimate)
+    if in_looks is not None:
+        estimate, marginals = in_looks.looks.flowers(estimate), in_looks.looks.flowers_marginals(marginals)
+        world = replace(world, T=estimate.T, X=estimate.X, places=estimate.places, lasting=in_looks.lasting)
+    marginals = with_unknown_scale(marginals, estimate, world.instruments, session.noise)
     clock.lap("smoothing")
-    return make_result(session, frames, world, smoother, estimate, marginals, config, seed, merged, clock.laps)
+    return make_result(session, frames, world, smoother, estimate, marginals, nis, config, seed, merged, clock.laps)
 
 
 def _associate_and_smooth(

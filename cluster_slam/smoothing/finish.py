@@ -13,9 +13,8 @@ from cluster_slam.association.displacement import (
 )
 from cluster_slam.association.frames import Frames, chi2_and_log_det
 from cluster_slam.config import SmoothConfig
-from cluster_slam.geometry import rotate_cov, transform
+from cluster_slam.geometry import Array, rotate_cov, transform
 from cluster_slam.graph.batch import BatchSmoother, Estimate, Marginals
-from cluster_slam.graph.innovations import squared_innovations
 from cluster_slam.landmark_tables import RestMap, cluster_table, drift_table, flower_table
 from cluster_slam.records import BoolArray, Calibration, Diagnostics, IntArray, RejectReason, Result, Session
 from cluster_slam.smoothing.world import World, fewest_observations
@@ -31,6 +30,7 @@ def make_result(
     smoother: BatchSmoother,
     estimate: Estimate,
     marginals: Marginals,
+    squared_innovation: Array,
     config: SmoothConfig,
     seed: int,
     merged: list[tuple[int, int]],
@@ -55,7 +55,7 @@ def make_result(
     reasons = np.full(len(frames), int(RejectReason.UNCONFIRMED))
     reasons[frames.order] = reject_reasons(frames, world, estimate, smoother, outlier)
     nis = np.full(len(frames), np.nan)
-    nis[frames.order] = squared_innovations(smoother, estimate)
+    nis[frames.order] = squared_innovation
     calibration = hand_eye_calibration(smoother, estimate, marginals)
     unobserved = () if calibration is None else tuple(f"hand-eye: {x}" for x in calibration.unobserved)
     return Result(
@@ -145,6 +145,9 @@ def estimated_noise(session: Session, frames: Frames, world: World, smoother: Ba
         shape = replace(shape, depth=factor * shape.depth, lateral=factor * shape.lateral)
         found |= {f"flower_{name}": value for name, value in asdict(shape).items()}
     found["pose_factor"] = float(np.sqrt(noise.pose))
+    if world.lasting is not None:
+        found["flower_lasting_along"] = world.lasting.along_m
+        found["flower_lasting_across"] = world.lasting.across_m
     if len(smoother.pairs.sigma):
         found["sway"] = float(np.sqrt((smoother.pairs.total_sigma**2).mean()))
     return found

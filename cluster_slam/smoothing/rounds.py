@@ -20,7 +20,7 @@ from cluster_slam.association.refine import compact, find_overlooked, merge_ghos
 from cluster_slam.association.springs import REST_SIGMA_M
 from cluster_slam.association.templates import Follower, combine_directions
 from cluster_slam.config import SmoothConfig
-from cluster_slam.geometry import transform
+from cluster_slam.geometry import Array, transform
 from cluster_slam.graph.batch import BatchSmoother, Estimate, Pairs
 from cluster_slam.graph.noise import camera_covs
 from cluster_slam.graph.poses import PoseModel
@@ -84,18 +84,20 @@ def solve(
     n_iterations: int,
     *,
     in_stretches: bool = False,
+    tied: Array | None = None,
 ) -> tuple[BatchSmoother, Estimate]:
     """Solve for poses, hand-eye transform, flowers and displacements, the association given.
 
     ``in_stretches``: displacements are correlated in time, as covariances need it; places hardly change by it.
+    ``tied`` (3 l, 3 l): information that places have of each other.
     """
-    smoother, start = problem(frames, model, world, in_stretches=in_stretches)
+    smoother, start = problem(frames, model, world, in_stretches=in_stretches, tied=tied)
     threshold = chi2_threshold(3, config.outlier_probability)
     return smoother, smoother.solve(start, threshold, n_iterations, is_smoothed=world.cov_step is not None)
 
 
 def problem(
-    frames: Frames, model: PoseModel, world: World, *, in_stretches: bool = False
+    frames: Frames, model: PoseModel, world: World, *, in_stretches: bool = False, tied: Array | None = None
 ) -> tuple[BatchSmoother, Estimate]:
     """The graph of the session and where its solution starts."""
     of, frame, cluster = cluster_pairs(frames, world.landmark, world.cluster)
@@ -125,7 +127,7 @@ def problem(
         residual_chi2=np.full(len(frames), np.nan),
     )
     correlation = NO_WEIGHT if world.errs_slowly else world.noise.correlation
-    return BatchSmoother(frames, model, world.landmark, pairs, correlation), start
+    return BatchSmoother(frames, model, world.landmark, pairs, correlation, tied), start
 
 
 def observations_err_slowly(frames: Frames, model: PoseModel, world: World) -> bool:

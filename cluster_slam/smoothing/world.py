@@ -16,6 +16,7 @@ from cluster_slam.graph.noise_shape import noise_shape
 from cluster_slam.graph.poses import PoseModel
 from cluster_slam.graph.variance import VarianceFactors, variance_factors
 from cluster_slam.records import IntArray, StatedNoise
+from cluster_slam.smoothing.lasting import LastingErrors
 
 NO_WEIGHT = 1e6  # observations that must not bend the trajectory count as one in so many
 _FEW_FRAMES = 8  # fewer confirm nothing
@@ -40,6 +41,7 @@ class World:
     only_sigma: float | None = None  # m, where that is all that is stated of the observations' noise
     shape: NoiseShape | None = None  # then what was found of it
     depth: Array | None = None  # (m,) m, where the flowers of observations are; NaN where that is not known
+    lasting: LastingErrors | None = None  # what of the observations' errors is no smaller in many frames of one view
     instruments: Calibration = field(default_factory=Calibration)  # what the session shows to be wrong with them
 
 
