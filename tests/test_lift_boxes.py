@@ -180,6 +180,23 @@ def test_flowers_at_a_wrong_depth_are_too_large_for_the_others() -> None:
     assert lifted.is_lifted.tolist() == [True, True, True, False, True, True, True]
 
 
+def test_a_middle_that_leans_comes_back_along_the_petals_plane() -> None:
+    """A flower tilted by 0.5 along u, whose box lies a tenth of its width times that to the side that it faces."""
+    lean, tangent, width, middle, z = 0.1, 0.5, 20.0, np.array([300.0, 200.0]), 0.4
+    v, u = np.mgrid[:480, :848]
+    slope = tangent * z / 430.0
+    depth = np.where((u - middle[0]) ** 2 + (v - middle[1]) ** 2 <= 90, z + slope * (u - middle[0]), 0.9)
+    leant = middle + np.array([lean * tangent * width, 0.0])
+    boxes = ImageDetections(leant[None], np.full((1, 2), width), np.ones(1))
+    lifted = lift_boxes(camera(), boxes, depth, convention="z", model=EXACT, sigma_px=np.ones(1), lean=lean)
+    np.testing.assert_allclose(lifted.centres[0], middle, atol=0.03)  # the tilt's own prior takes a little of it
+    np.testing.assert_allclose(lifted.depths, z, atol=1e-4)
+    np.testing.assert_allclose(camera().project(lifted.points)[0], middle, atol=0.05)
+    plain = lift_boxes(camera(), boxes, depth, convention="z", model=EXACT, sigma_px=np.ones(1))
+    np.testing.assert_array_equal(plain.centres, boxes.centres)
+    assert lifted.sigma_px[0] >= plain.sigma_px[0] == 1.0
+
+
 def test_no_boxes() -> None:
     none = ImageDetections(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
     lifted = lift_boxes(camera(), none, scene(), convention="z", model=EXACT, sigma_px=np.empty(0))

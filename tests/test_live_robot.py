@@ -76,6 +76,8 @@ def test_a_robot_that_is_lost_at_the_start(tmp_path: Path) -> None:
 class OneBox:
     """A detector that always sees one flower at pixel (200, 120)."""
 
+    lean = 0.0
+
     def detect(self, image: np.ndarray) -> ImageDetections:
         assert image.shape == (240, 320, 3)
         return ImageDetections(np.array([[200.0, 120.0]]), np.array([[40.0, 40.0]]), np.array([0.75]))

@@ -42,6 +42,11 @@ class ColourDetector:
             rows += [(x + u, y + v, a, b, s) for u, v, a, b, s in boxes if s >= self.min_score]
         return _sorted(rows)
 
+    @property
+    def lean(self) -> float:
+        """None: a blob's middle is that of the petals that are seen."""
+        return 0.0
+
     def sigma_px(self, sizes: Array) -> Array:
         """An eighth of a box: what is hidden of a flower moves its blob."""
         sigma: Array = np.hypot(0.5, 0.125 * np.sqrt(sizes.prod(1)))

@@ -99,6 +99,7 @@ class OnnxDetector:
         stated = signature.metadata.get("score")
         self._least = score if score is not None else float(stated) if stated else _LEAST.get(kind, 0.4)
         self._sigma = _stated_sigma(signature)
+        self._lean = float(signature.metadata.get("lean", "0"))
 
     def detect(self, image: NDArray[np.uint8]) -> ImageDetections:
         """Boxes of the flowers in a picture (h, w, 3), 8 bits, blue green red; best first."""
@@ -116,6 +117,11 @@ class OnnxDetector:
         corner = 0.0 if self._counts_from_middle else 0.5  # a box's edges count from the picture's corner
         centres, sizes = placement.back(kept.centres - corner, kept.sizes)
         return ImageDetections(centres, sizes, kept.scores)
+
+    @property
+    def lean(self) -> float:
+        """How far its middles lie to where flowers face, as the model states it."""
+        return self._lean
 
     def sigma_px(self, sizes: Array) -> Array:
         """Sigma (k,) of u and of v of the middles of boxes (k, 2), pixels."""

@@ -24,6 +24,11 @@ _SHOWN = 3  # problems that are told one by one
 class Detector(Protocol):
     """Finds flowers in a picture."""
 
+    @property
+    def lean(self) -> float:
+        """How far its middles lie to where flowers face: widths for each unit of the tangent of their tilt."""
+        ...
+
     def detect(self, image: NDArray[np.uint8]) -> ImageDetections:
         """Boxes of the flowers in a picture (h, w, 3), 8 bits, blue green red; best first."""
         ...
@@ -81,8 +86,9 @@ def observe_pictures(
             model=model,
             sigma_px=sigma_px,
             image=shot.colour,
+            lean=detector.lean,
         )
-        rows.append((shot.frame, boxes, sigma_px, lifted))
+        rows.append((shot.frame, boxes, lifted))
     return _together(rows, seen)
 
 
@@ -126,13 +132,13 @@ class _Seen:
         return found
 
 
-def _together(rows: list[tuple[int, ImageDetections, Array, LiftedBoxes]], seen: _Seen) -> PictureDetections:
+def _together(rows: list[tuple[int, ImageDetections, LiftedBoxes]], seen: _Seen) -> PictureDetections:
     def column(values: list[Array], shape: tuple[int, ...]) -> Array:
         return np.concatenate([*values, np.empty((0, *shape))])
 
-    frame = np.concatenate([np.full(len(b), k) for k, b, _, _ in rows] + [np.empty(0, np.int64)]).astype(np.int64)
+    frame = np.concatenate([np.full(len(b), k) for k, b, _ in rows] + [np.empty(0, np.int64)]).astype(np.int64)
     keep = np.concatenate([lifted.is_lifted for *_, lifted in rows] + [np.empty(0, bool)])
-    boxes = [b for _, b, _, _ in rows]
+    boxes = [b for _, b, _ in rows]
     scores = column([b.scores for b in boxes], ())[keep]
     n_boxes, n_lifted = len(keep), int(keep.sum())
     points = column([lifted.points for *_, lifted in rows], (3,))[keep]
@@ -140,10 +146,12 @@ def _together(rows: list[tuple[int, ImageDetections, Array, LiftedBoxes]], seen:
     return PictureDetections(
         frame[keep],
         ImageDetections(
-            column([b.centres for b in boxes], (2,))[keep], column([b.sizes for b in boxes], (2,))[keep], scores
+            column([lifted.centres for *_, lifted in rows], (2,))[keep],
+            column([b.sizes for b in boxes], (2,))[keep],
+            scores,
         ),
         column([lifted.depths for *_, lifted in rows], ())[keep],
-        column([s for _, _, s, _ in rows], ())[keep],
+        column([lifted.sigma_px for *_, lifted in rows], ())[keep],
         column([lifted.sigma_depths for *_, lifted in rows], ())[keep],
         Observations(frame[keep], points, covs, scores, True),
         tuple(seen.warnings(n_boxes, n_lifted)),

@@ -24,6 +24,8 @@ _DEEP = 0.3  # in widths: what is so near the plane of a flower's petals is thei
 class LiftedBoxes:
     """Flowers of one picture; rows as the detections, NaN where a box has no depth."""
 
+    centres: Array  # (k, 2) where the flowers' middles are, pixels: the boxes', less what they lean
+    sigma_px: Array  # (k,) of u and of v of these
     depths: Array  # (k,) m, as the depth image measures them
     sigma_depths: Array  # (k,) m
     points: Array  # (k, 3) camera frame, m
@@ -40,6 +42,7 @@ def lift_boxes(
     model: DepthModel,
     sigma_px: Array,
     image: NDArray[np.uint8] | None = None,
+    lean: float = 0.0,
 ) -> LiftedBoxes:
     """Points of all boxes that have a depth.
 
@@ -59,19 +62,21 @@ def lift_boxes(
         (k,) sigma of u and of v of the boxes' middles.
     image
         (h, w, 3) the colour picture, which helps to tell petals from what is before and behind; None: there is none.
+    lean
+        How far the detector's middles lie to where flowers face: widths for each unit of the tangent of their tilt.
     """
     focal = (camera.fx + camera.fy) / 2
     found = _petal_depths(np.column_stack([boxes.centres, boxes.sizes]), depth, focal, model, image)
-    depths = np.array([f.depth for f in found])
     sigmas = np.array([f.sigma for f in found])
     slopes = np.array([(f.slope_u, f.slope_v) for f in found]).reshape(-1, 2)
+    centres, depths, sigma_px = _upright(boxes, found, slopes, sigma_px, lean * focal)
     points, covs = np.full((len(found), 3), np.nan), np.full((len(found), 3, 3), np.nan)
     good = np.isfinite(depths) & _are_alike(boxes.sizes.max(axis=1, initial=0.0) * depths)
     good &= _are_seen(np.array([f.seen for f in found]), np.isfinite(depths))
     if good.any():
         points[good], covs[good] = lift_unscented(
             camera,
-            boxes.centres[good],
+            centres[good],
             depths[good],
             convention=convention,
             sigma_px=sigma_px[good],
@@ -81,7 +86,23 @@ def lift_boxes(
             centre_sigma_px=model.centre_sigma_px,
         )
     good &= np.isfinite(points).all(1)
-    return LiftedBoxes(depths, sigmas, points, covs, good)
+    return LiftedBoxes(centres, sigma_px, depths, sigmas, points, covs, good)
+
+
+def _upright(
+    boxes: ImageDetections, found: list[PetalDepth], slopes: Array, sigma_px: Array, lean_px: float
+) -> tuple[Array, Array, Array]:
+    """Middles (k, 2), depths there (k,) and sigmas (k,) of the middles, brought back from the side they lean to.
+
+    A petal's plane whose depth grows with u faces the other way; the tangent of its tilt is the slope over the metres
+    of a pixel, depth / focal length. ``lean_px``: widths for each unit of it, times the focal length.
+    """
+    depths = np.array([f.depth for f in found])
+    with np.errstate(invalid="ignore"):
+        reach = lean_px * np.sqrt(boxes.sizes.prod(axis=1)) / depths
+        away = np.where(np.isfinite(depths)[:, None], reach[:, None] * slopes, 0.0)
+        own = np.where(np.isfinite(depths), reach * np.array([f.sigma_slope for f in found]), 0.0)
+    return boxes.centres - away, depths - (slopes * away).sum(axis=1), np.hypot(sigma_px, own)
 
 
 def _petal_depths(

@@ -40,6 +40,7 @@ class PetalDepth:
     sigma: float  # m
     slope_u: float  # m / px
     slope_v: float
+    sigma_slope: float = 0.0  # m / px, of either
     seen: float = 0.0  # share of the box's ellipse that is petals with a depth
 
 
@@ -191,7 +192,8 @@ def _plane(
         residual = z - X @ solution
         scale = max(float(np.hypot(noise, relief)), 1.4826 * float(np.median(np.abs(residual))))
         robust = np.maximum(1.0 - (residual / (_TUKEY * scale)) ** 2, 0.0) ** 2
-    variance = float(np.linalg.solve(A, np.eye(3)[0])[0]) * max(1.0, scale**2 / (noise_var + relief**2))
+    covariance = np.linalg.solve(A, np.eye(3)) * max(1.0, scale**2 / (noise_var + relief**2))
+    variance, sigma_slope = float(covariance[0, 0]), float(np.sqrt(0.5 * (covariance[1, 1] + covariance[2, 2])))
     step = model.unit_m**2 / 12.0
     sigma = float(np.sqrt(variance + relief**2 + step))
-    return PetalDepth(float(solution[0]), sigma, float(solution[1]), float(solution[2]))
+    return PetalDepth(float(solution[0]), sigma, float(solution[1]), float(solution[2]), sigma_slope)

@@ -46,6 +46,7 @@ class FlowerFinder:
             model=depth_model(self.camera.depth_camera or "generic", focal_px=focal),
             sigma_px=self.detector.sigma_px(boxes.sizes),
             image=view.colour,
+            lean=self.detector.lean,
         )
         keep = lifted.is_lifted
         return replace(view, points=lifted.points[keep], covs=lifted.covs[keep], scores=boxes.scores[keep])

@@ -92,15 +92,11 @@ def _axes(points: Array) -> tuple[Array, Array, Array]:
 
 def one_view(view: Array, step: float) -> IntArray:
     """Number of the view (m,) to which each of (m, 3, 3) belongs: those less than ``step`` rad from its first."""
-    first: list[int] = []
-    of = np.empty(len(view), dtype=np.int64)
-    for k in range(len(view)):
-        apart = turns(view[k : k + 1], view[first])[0]
-        nearest = int(apart.argmin()) if len(first) else 0
-        if not len(first) or apart[nearest] > step:
-            nearest = len(first)
-            first.append(k)
-        of[k] = nearest
+    of = np.full(len(view), -1, dtype=np.int64)
+    number = 0
+    while (free := np.flatnonzero(of < 0)).size:
+        of[free[turns(view[free[:1]], view[free])[0] <= step]] = number
+        number += 1
     return of
 
 
