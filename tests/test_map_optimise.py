@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from map_help import SMALL, map_of, rest_incoming
 
 from cluster_slam.cli.app import run
@@ -56,3 +57,16 @@ def test_a_map_is_optimised(tmp_path: Path) -> None:
     assert len(after.cluster_ids) >= 7
     assert run(["map", "undo", str(tmp_path / "row3.map"), "--quiet"]) == 0
     assert run(["map", "undo", str(tmp_path / "row3.map"), "--quiet"]) == 2  # before it was optimised
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_turns_that_few_clusters_leave_open_stay_small(n: int) -> None:
+    """One cluster tells no turn, two none about the line between them: a shift of 7 mm becomes no turn beyond it."""
+    places = np.array([[0.3, 0.1, 0.8], [-0.2, 0.4, 0.9]])[:n]
+    begin = se3_exp(np.array([[0.0] * 6, [0.3, -0.2, 0.5, 0.1, 0.2, -0.1]]))
+    seen = transform(inverse(begin[1]), places + 0.004)
+    sessions, clusters = np.repeat([0, 1], n), np.tile(np.arange(n), 2)
+    local, days = np.concatenate([places, seen]), np.repeat([0.0, 1.0], n)
+    found = smooth_sessions(Sightings(sessions, clusters, local, days, np.full(2 * n, 0.001)), begin, 0.003)
+    np.testing.assert_allclose(found.T_map_world[:, :3, :3], begin[:, :3, :3], atol=0.007)  # seen from a metre
+    np.testing.assert_allclose(transform(found.T_map_world[1], seen), places, atol=1e-4)

@@ -122,8 +122,8 @@ def _linear(
     for c in range(len(velocities)):
         b = -prior @ np.concatenate([np.zeros(3), velocities[c]])
         graph.add(gtsam.JacobianFactor(_cluster(c), prior, b, _UNIT[6]))
-    for s in range(1, len(T)):  # a session that shares nothing with the others stays where it is
-        graph.add(gtsam.JacobianFactor(_pose(s), 1e-2 * np.eye(6), np.zeros(6), _UNIT[6]))
+    for s in range(1, len(T)):  # what a session does not share with the others to tell stays as it is: a turn, or all
+        graph.add(gtsam.JacobianFactor(_pose(s), np.eye(6), np.zeros(6), _UNIT[6]))  # to a radian, and a metre
     return graph
 
 
