@@ -23,6 +23,7 @@ _STEP = 0.1  # rad: frames of one view
 _TURNS = (0.1, 0.2, 0.4, 0.6, 0.9, 1.5)  # rad: with the last, little is left after half a turn about the flower
 _FEWEST_FRAMES = 10  # in which neighbours were seen together
 _FEWEST_PAIRS = 3
+_LEAST = 0.03  # of the variance of one observation: less may be a lens, or a board that is not quite flat
 _FIRST_TURN = 0.4  # rad: where nothing is found with it, nothing is there
 _SEARCH: dict[str, Any] = {  # for the log of what lasts, in sigmas of one observation
     "bounds": (-6.0, 2.0),
@@ -117,7 +118,7 @@ def lasting_errors(
     if _fit(pairs, new, _FIRST_TURN).gain < 0.5 * _SURE:
         return None
     best = max((_fit(pairs, new, turn) for turn in _TURNS), key=lambda fit: fit.gain)
-    if best.gain < _SURE:
+    if best.gain < _SURE or best.share < _LEAST:
         return None
     return LastingErrors(best.along_m, best.across_m, float(new[0]), float(new[1]), best.turn)
 
@@ -189,25 +190,30 @@ class _Means:
 
 
 class _Fit(NamedTuple):
-    """How large what lasts is, and the log of how much likelier that is than nothing."""
+    """How large what lasts is, at most as a share of one observation's variance, and how much likelier than nothing.
+
+    That is the log of the ratio.
+    """
 
     along_m: float
     across_m: float
     turn: float
+    share: float
     gain: float
 
 
 def _fit(pairs: list[_Means], new: Array, turn: float) -> _Fit:
     """The likeliest for errors that change over ``turn`` (rad), ``new`` (2,) of the stated variances new each time."""
     correlations = [np.exp(-turns(pair.view, pair.view) / turn) for pair in pairs]
-    sigma, gain = [], 0.0
+    sigma, largest, gain = [], 0.0, 0.0
     for share, axes in zip(new.tolist(), ((0,), (1, 2)), strict=True):
         unit = float(np.median(np.concatenate([(pair.var * pair.n[:, None])[:, axes].ravel() for pair in pairs])))
         cost = partial(_cost, pairs, correlations, axes, share)
         found = minimize_scalar(lambda s, c=cost, u=unit: c(u * np.exp(2.0 * s)), **_SEARCH)
         sigma.append(float(np.sqrt(unit) * np.exp(found.x)))
+        largest = max(largest, 2.0 * float(np.exp(2.0 * found.x)))  # the unit is of the difference of two flowers
         gain += cost(0.0) - float(found.fun)
-    return _Fit(sigma[0], sigma[1], turn, gain)
+    return _Fit(sigma[0], sigma[1], turn, largest, gain)
 
 
 def _cost(pairs: list[_Means], correlations: list[Array], axes: tuple[int, ...], new: float, lasts: float) -> float:
