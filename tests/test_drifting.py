@@ -9,7 +9,7 @@ from cluster_slam.association.drift_joining import assemble
 from cluster_slam.association.drift_labels import Labelling, View
 from cluster_slam.association.drift_session import DriftSession
 from cluster_slam.association.drift_smoother import DriftSmoother, steps_of
-from cluster_slam.association.drifting import needs_tracing, trace_drifting
+from cluster_slam.association.drifting import drifts_far, frames_tell_poses, trace_drifting
 from cluster_slam.association.frames import Frames, sort_by_frame
 from cluster_slam.config import ParticleConfig
 from cluster_slam.evaluation.trajectory import absolute_error
@@ -89,7 +89,8 @@ def test_gradient_vanishes_at_the_solution(world: _World) -> None:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_every_landmark_once_and_the_way_found(seed: int) -> None:
     world = _World(seed)
-    assert needs_tracing(world.frames, world.given, world.cov_step)
+    assert drifts_far(world.frames, world.given, world.cov_step)
+    assert not frames_tell_poses(world.frames)
     traced = trace_drifting(
         world.frames, world.given, world.cov_step, ParticleConfig(n_particles=60), rng=np.random.default_rng(0)
     )
@@ -102,7 +103,7 @@ def test_every_landmark_once_and_the_way_found(seed: int) -> None:
 
 
 def test_poses_that_hardly_drift_are_kept(world: _World) -> None:
-    assert not needs_tracing(world.frames, world.given, 1e-4 * world.cov_step)
+    assert not drifts_far(world.frames, world.given, 1e-4 * world.cov_step)
 
 
 def _standing(places: Array, n: int) -> tuple[Labelling, Array]:

@@ -229,6 +229,17 @@ def test_one_moderate_session() -> None:
 # --- options
 
 
+def test_poses_that_drift_farther_than_flowers_stand_apart() -> None:
+    """One metre in five is wrong when the camera comes back: laid upon each other by such poses, pieces mix flowers."""
+    config = replace(PRESETS["moderate-odometry"], duration_s=12.0, fps=10.0, odometry_translation=0.2)
+    made = simulate_session(config, seed=6)
+    metrics = evaluate(smooth(made.session), made.session, made.truth)
+    assert metrics.cluster_idf1 is not None
+    assert metrics.cluster_idf1 > 0.99
+    assert metrics.flower_idf1 is not None
+    assert metrics.flower_idf1 > 0.98
+
+
 def test_a_given_number_of_clusters() -> None:
     config = SmoothConfig(grouping=GroupingConfig("kmeans", n_clusters=6))
     result = smooth(made().session, config=config, seed=3)

@@ -42,20 +42,20 @@ class Traced:
     instruments: Calibration
 
 
-def needs_tracing(frames: Frames, given: Array, cov_step: Array) -> bool:
-    """Whether poses (n, 4, 4) drift too far, and frames hold too few points, for an association by the given poses.
-
-    Where frames hold more points than their pose has unknowns, pieces correct the drift by themselves; and drift that
-    stays below the noise of the points does no harm.
-    """
-    n_seen = len(seen_frames(frames))
-    if n_seen < 3:
+def drifts_far(frames: Frames, given: Array, cov_step: Array) -> bool:
+    """Whether poses (n, 4, 4) drift too far for an association by the given poses: by more than the points' noise."""
+    if len(seen_frames(frames)) < 3:
         return False
     range_sq = float(np.median((frames.points**2).sum(axis=1)))
     total = cov_step.sum(axis=0)
     drift_sq = np.trace(total[3:, 3:]) + np.trace(total[:3, :3]) * range_sq
     noise_sq = float(np.median(np.trace(frames.covs, axis1=1, axis2=2)))
-    return bool(drift_sq > 9.0 * noise_sq and len(frames) < 6 * n_seen)
+    return bool(drift_sq > 9.0 * noise_sq)
+
+
+def frames_tell_poses(frames: Frames) -> bool:
+    """Whether frames usually hold more points than their pose has unknowns, and so correct its drift."""
+    return len(frames) >= 6 * len(seen_frames(frames))
 
 
 def trace_drifting(

@@ -79,9 +79,7 @@ def _tables(session: Session, tracker: OnlineTracker, flower_ids: IntArray) -> t
     names = np.array([k.id for k in tracker.world.clusters], dtype=np.int64)
     used, cluster = np.unique(names[table.slot[rows]], return_inverse=True)
     frames = sort_by_frame(session.observations, session.stamps)
-    rest = RestMap(
-        table.place[rows], tracker.joint_cov(rows), cluster, _rows_of(flower_ids[frames.order], ids, tracker)
-    )
+    rest = RestMap(table.place[rows], tracker.joint_cov(rows), cluster, rows_of(flower_ids[frames.order], ids, tracker))
     flowers = flower_table(rest, frames)
     slot_of = {k.id: k for k in tracker.world.clusters}
     clusters = cluster_table(rest, frames, np.ones(len(used), dtype=bool))
@@ -97,7 +95,7 @@ def _tables(session: Session, tracker: OnlineTracker, flower_ids: IntArray) -> t
     return flowers, replace(clusters, ids=used, states=states)
 
 
-def _rows_of(labels: IntArray, ids: IntArray, tracker: OnlineTracker) -> IntArray:
+def rows_of(labels: IntArray, ids: IntArray, tracker: OnlineTracker) -> IntArray:
     """Row among ``ids`` of each label (m,), merged ones by what they became; -1 for those that are no more."""
     into = dict(tracker.world.merged)
     known = np.unique(labels)

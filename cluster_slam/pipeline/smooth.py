@@ -13,6 +13,7 @@ from cluster_slam.config import SmoothConfig
 from cluster_slam.graph.innovations import squared_innovations
 from cluster_slam.graph.noise import pose_model
 from cluster_slam.graph.poses import PoseModel
+from cluster_slam.pipeline.followed import world_followed_live
 from cluster_slam.records import Result, Session
 from cluster_slam.smoothing.again import follow_joined, same_noise, settle_again
 from cluster_slam.smoothing.finish import make_result
@@ -57,7 +58,9 @@ def smooth(
     stated = sort_by_frame(session.observations, session.stamps)
     stated_poses = pose_model(session)
     say("calibrating", 0.0)
-    world = first_world(stated, stated_poses, config, rng)
+    world = first_world(
+        stated, stated_poses, config, rng, lambda: world_followed_live(session, stated, stated_poses, seed)
+    )
     if not session.observations.has_covariance:
         world = replace(world, only_sigma=session.noise.flower)
     stated, stated_poses = corrected(stated, stated_poses, world.instruments)

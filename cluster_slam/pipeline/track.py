@@ -218,12 +218,17 @@ def _begin(
     return tracker, 0
 
 
-def _check_mount(session: Session, given: Calibration | None) -> None:
-    """Refuse a camera of which nobody knows how it is mounted: a live tracker cannot try all orientations."""
+def can_be_tracked(session: Session) -> bool:
+    """Whether the camera's mount is known well enough: a live tracker cannot try all orientations."""
     n = session.noise
-    if session.T_flange_camera is None or given is not None:
-        return
-    if n.hand_eye_rotation > _UNKNOWN_RAD or n.hand_eye_translation > _UNKNOWN_M:
+    is_known = n.hand_eye_rotation <= _UNKNOWN_RAD and n.hand_eye_translation <= _UNKNOWN_M
+    return session.T_flange_camera is None or is_known
+
+
+def _check_mount(session: Session, given: Calibration | None) -> None:
+    """Refuse a camera of which nobody knows how it is mounted."""
+    n = session.noise
+    if given is None and not can_be_tracked(session):
         known = f"known to {n.hand_eye_translation:g} m and {n.hand_eye_rotation:g} rad"
         expected = "expected --calibration FILE (smooth and calibrate find the transform)"
         raise InputError(f"{session.id}: the hand-eye transform is only {known}, {expected}")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from cluster_slam.association.displacement import (
     presence_of,
 )
-from cluster_slam.association.drifting import needs_tracing, trace_drifting
+from cluster_slam.association.drifting import drifts_far, frames_tell_poses, trace_drifting
 from cluster_slam.association.frames import Frames, view_volume
 from cluster_slam.association.landmarks import flower_spacing, group_means, merge_pieces
 from cluster_slam.association.refine import compact, supported
@@ -28,13 +30,24 @@ _ODOMETRY_ROUNDS = 2  # of pieces and poses, which drift the less the longer the
 _CALM_HAND_EYE_RAD = 0.005  # a hand-eye transform known so well does not spoil pieces
 
 
-def first_world(stated: Frames, stated_poses: PoseModel, config: SmoothConfig, rng: np.random.Generator) -> World:
-    """Landmarks to begin with, in one of two ways: poses that drift too far are followed, others can be relied upon."""
+def first_world(
+    stated: Frames,
+    stated_poses: PoseModel,
+    config: SmoothConfig,
+    rng: np.random.Generator,
+    followed: Callable[[], World | None],
+) -> World:
+    """Landmarks to begin with: poses that drift too far are followed, others can be relied upon.
+
+    ``followed`` gives what a tracker finds that corrects each pose by the landmarks so far; None for nothing.
+    """
     _, step = camera_covs(stated_poses, stated_poses.X0)
     T = stated_poses.given if stated_poses.X0 is None else stated_poses.given @ stated_poses.X0
-    if step is not None and needs_tracing(stated, T, step):
+    if step is None or not drifts_far(stated, T, step):
+        return world_of_pieces(stated, stated_poses, config, rng)
+    if not frames_tell_poses(stated):
         return world_of_drifting_poses(stated, stated_poses, T, step, config, rng)
-    return world_of_pieces(stated, stated_poses, config, rng)
+    return followed() or world_of_pieces(stated, stated_poses, config, rng)
 
 
 def world_of_drifting_poses(
@@ -103,10 +116,15 @@ def _landmarks_of_pieces(
 ) -> tuple[IntArray, Array, float]:
     """Landmark of each observation (m,), places (l, 3), and within what radius pieces were taken for one flower."""
     w, var = transform(T[frames.frame], frames.points), scalar_var(frames, model)
-    radius = 0.65 * spacing(frames, w, var, labels, shortest)
+    radius = radius_of_pieces(frames, w, var, labels, shortest)
     landmark, places = merge_pieces(w, var, labels, frames.frame, frames.n_frames, radius, shortest)
     keep = supported(frames, T, places, landmark, fewest_observations(frames, config))
     return compact(keep, landmark), places[keep], radius
+
+
+def radius_of_pieces(frames: Frames, w: Array, var: Array, labels: IntArray, shortest: int) -> float:
+    """Within what radius, m, pieces are of one flower: less than flowers stand apart."""
+    return 0.65 * spacing(frames, w, var, labels, shortest)
 
 
 def _smoothed_by_pieces(
