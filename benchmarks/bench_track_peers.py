@@ -108,11 +108,15 @@ class Norfair:
 
 
 class StoneSoup:
-    """Stone Soup's multi-target tracker with constant velocity, a UKF, and GNN or JPDA."""
+    """Stone Soup's multi-target tracker with constant velocity, a UKF, and GNN or JPDA.
+
+    JPDA is the one by efficient hypothesis management: the same probabilities, without listing every joint hypothesis
+    (of some forty tracks these are too many).
+    """
 
     def __init__(self, kind: str, clutter_density: float) -> None:
         from stonesoup.dataassociator.neighbour import GNNWith2DAssignment
-        from stonesoup.dataassociator.probability import JPDA
+        from stonesoup.dataassociator.probability import JPDAwithEHM2
         from stonesoup.deleter.time import UpdateTimeStepsDeleter
         from stonesoup.hypothesiser.distance import DistanceHypothesiser
         from stonesoup.hypothesiser.probability import PDAHypothesiser
@@ -130,7 +134,7 @@ class StoneSoup:
         predictor, updater = UnscentedKalmanPredictor(motion), UnscentedKalmanUpdater(None)
         nearest = DistanceHypothesiser(predictor, updater, Mahalanobis(), missed_distance=4.0)
         likeliest = PDAHypothesiser(predictor, updater, clutter_density, prob_detect=0.9, prob_gate=0.999)
-        associator: Any = GNNWith2DAssignment(nearest) if kind == "GNN" else JPDA(likeliest)
+        associator: Any = GNNWith2DAssignment(nearest) if kind == "GNN" else JPDAwithEHM2(likeliest)
         prior = GaussianState(np.zeros((6, 1)), np.diag([1.0, 0.01] * 3), timestamp=None)
         initiator = MultiMeasurementInitiator(
             prior, UpdateTimeStepsDeleter(4), GNNWith2DAssignment(nearest), updater, min_points=3
