@@ -47,7 +47,8 @@ def test_instants_are_all_known_clusters_ten_times_a_second(run: tuple[Result, I
     pairs = zip(instants.cluster[last].tolist(), instants.position[last], strict=True)
     gaps = [float(np.linalg.norm(position - rest[cluster])) for cluster, position in pairs if cluster in rest]
     assert len(gaps) >= 3
-    assert np.median(gaps) < 0.01  # flowers are still being grouped, so single ones may differ
+    assert min(gaps) < 0.005  # flowers are still being grouped, and some sway, so single ones differ
+    assert max(gaps) < 0.05
 
 
 def test_the_picture_is_that_of_the_camera() -> None:

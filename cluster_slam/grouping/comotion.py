@@ -41,16 +41,16 @@ from cluster_slam.grouping.lasting import (
 )
 from cluster_slam.records import IntArray
 
-_WINDOW_S = 0.4  # motion hardly changes for so long
-_SIGNIFICANT = 11.3  # chi-square, 3 degrees of freedom, 99 %
-_FEWEST_FRAMES = 5
-_SYSTEMATIC = 0.02  # of an observation's variance: how well places at rest are known, which does not average out
-_SURE = 0.33  # motion of three times its own standard deviation is there at all
+WINDOW_S = 0.4  # motion hardly changes for so long
+SIGNIFICANT = 11.3  # chi-square, 3 degrees of freedom, 99 %
+FEWEST_FRAMES = 5
+SYSTEMATIC = 0.02  # of an observation's variance: how well places at rest are known, which does not average out
+SURE = 0.33  # motion of three times its own standard deviation is there at all
 _APART = (0.66, 0.27)  # ratio of flowers of two clusters, mean and sigma
 _ALIKE = 0.3  # of pairs of two clusters lie anywhere from 0 to _RANGE instead, with the density of ratio ** (power - 1)
 _POWER = (0.4, 0.07)  # at no stretch of motion, and for each: one touch may move two clusters alike, ten do not
 _RIGID = 0.02  # ratio within a cluster that does not turn
-_NEAR = 0.3  # of the reach: flowers so near each other are mostly of one cluster
+NEAR = 0.3  # of the reach: flowers so near each other are mostly of one cluster
 _TELLS = 0.1  # standard deviation of a ratio that tells of turning
 _FEWEST_PAIRS = 10
 _MOST_TURNING = 0.3
@@ -62,7 +62,7 @@ _ALIKE_DOF = 4.0  # flowers' lasting errors are alike as far as sample variances
 _N_FACTORS = 32  # equally probable ones of their usual variance
 _FACTORS = _ALIKE_DOF / chi2.ppf((np.arange(_N_FACTORS) + 0.5) / _N_FACTORS, _ALIKE_DOF)
 # Only moments that are significant are looked at: if it was errors, then large ones.
-_IF_SELECTED = chi2.sf(_SIGNIFICANT / _FACTORS, 3) / chi2.sf(_SIGNIFICANT / _FACTORS, 3).mean()
+_IF_SELECTED = chi2.sf(SIGNIFICANT / _FACTORS, 3) / chi2.sf(SIGNIFICANT / _FACTORS, 3).mean()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,12 +93,12 @@ def motion_evidence(places: Array, motion: Motion, reach: float) -> csr_matrix:
     # Sway averages out over a spell: it is not taken for lasting errors, even where all neighbours move apart.
     share = lasting_share(places, motion.u, var, _stretches(motion.stamps, SPELL_S))
     ratios = pair_ratios(pairs, Motion(motion.u, var, motion.stamps), share)
-    known = ratios.sigma < _SURE
+    known = ratios.sigma < SURE
     pairs, ratios = pairs[known], Ratios(*(x[known] for x in ratios))
     if len(pairs) == 0:
         return csr_matrix((n, n))
     distance = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
-    evidence = log_likelihood_ratio(ratios, turning_ratio(ratios, distance, _NEAR * reach))
+    evidence = log_likelihood_ratio(ratios, turning_ratio(ratios, distance, NEAR * reach))
     upper = csr_matrix((evidence, (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     return csr_matrix(upper + upper.T)
 
@@ -119,7 +119,7 @@ def log_likelihood_ratio(ratios: Ratios, turning: Array | float) -> Array:
 def _given_lasting(ratios: Ratios, factor: float) -> tuple[Ratios, Array]:
     """The ratios if lasting errors have ``factor`` times their usual variance; share of motion that is left (p,)."""
     more = (factor - 1.0) * ratios.lasting
-    left = np.maximum(1.0 - more, np.minimum(ratios.sigma / _SURE, 1.0))
+    left = np.maximum(1.0 - more, np.minimum(ratios.sigma / SURE, 1.0))
     # Of squares of errors (chi-square) and of their product, over as many axes and independent stretches as there are.
     fluctuation = factor * ratios.lasting * np.sqrt(3.0 / np.maximum(3.0 / _LASTS * ratios.n_stretches, 3.0))
     sigma = np.hypot(ratios.sigma, fluctuation) / left
@@ -177,14 +177,14 @@ def pair_ratios(pairs: NDArray[Any], motion: Motion, share: float) -> Ratios:
     for i, (f, g) in enumerate(pairs.tolist()):
         signal = power[:, f] + power[:, g]
         k = np.flatnonzero(seen[:, f] & seen[:, g])
-        if len(k) < _FEWEST_FRAMES or not (signal[k] > 0.0).any():
+        if len(k) < FEWEST_FRAMES or not (signal[k] > 0.0).any():
             continue
         at = np.ix_(k, [f, g])
         u, var = motion.u[at], motion.var[at]
         if share > 0.0:  # of the same frames for both: in motion, means over different ones differ
             u, var = without_lasting(u, var, motion.stamps[k], share)
         used = np.isfinite(var).all(axis=1) & (signal[k] > 0.0)
-        if used.sum() >= _FEWEST_FRAMES:
+        if used.sum() >= FEWEST_FRAMES:
             k, u, noise = k[used], u[used], var[used].sum(axis=1)
             sums[:, i] = _pair_sums(u[:, 0], u[:, 1], noise, signal[k], stretch[k] - stretch[k[0]])
     lasting = REMAINS * share
@@ -193,11 +193,11 @@ def pair_ratios(pairs: NDArray[Any], motion: Motion, share: float) -> Ratios:
     total[~(total > 0.0)] = np.nan
     # Of noise alone, whose squares are chi-square, those that are not the largest are smaller than the mean.
     left = share_of_smallest(kept)
-    sigma: Array = np.hypot(np.sqrt(6.0 * noise_fourth), _SYSTEMATIC * noise_sq) / total
+    sigma: Array = np.hypot(np.sqrt(6.0 * noise_fourth), SYSTEMATIC * noise_sq) / total
     return Ratios((different - (left + lasting) * noise_sq) / total, sigma, stretches, lasting * noise_sq / total)
 
 
-def _stretches(stamps: Array, length_s: float = _WINDOW_S) -> IntArray:
+def _stretches(stamps: Array, length_s: float = WINDOW_S) -> IntArray:
     """In which stretch each frame (n,) is."""
     index: IntArray = np.floor((stamps - stamps[0]) / length_s).astype(np.int64)
     return index
@@ -228,7 +228,7 @@ def _power(motion: Motion, share: float) -> Array:
         motion = Motion(*without_lasting(motion.u, motion.var, stamps, share), stamps)
     seen = np.isfinite(motion.var)
     dt = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
-    half = max(1, round(0.5 * _WINDOW_S / dt))
+    half = max(1, round(0.5 * WINDOW_S / dt))
     information: Array = np.where(seen, 1.0 / np.where(seen, motion.var, 1.0), 0.0)
     total = _others(information, half)
     n_others = _others(1.0 * seen, half)
@@ -238,7 +238,7 @@ def _power(motion: Motion, share: float) -> Array:
     square = np.zeros_like(total)
     for axis in range(3):
         square += (noise * _others(information * u[..., axis], half)) ** 2
-    power: Array = np.where((noise > 0.0) & (square > _SIGNIFICANT * uncertain), square / 3.0 - uncertain, 0.0)
+    power: Array = np.where((noise > 0.0) & (square > SIGNIFICANT * uncertain), square / 3.0 - uncertain, 0.0)
     return power
 
 

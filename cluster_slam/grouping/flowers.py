@@ -24,7 +24,7 @@ _TOGETHER = (0.8, 0.15)  # share of a flower's frames that show its nearest, too
 _TOGETHER_OF_NONE = (0.45, 0.13)  # in sessions of things that stand alone
 _SURE = 3.0  # log-likelihood, 20 to 1, that flowers move as one
 _LIKELIER = 1.0  # log-likelihood: six flowers that are all loose gain as much by chance in one of twelve draws
-_REACH = 7.0  # spacings; flowers that far apart are of two clusters, whatever they do
+REACH = 7.0  # spacings; flowers that far apart are of two clusters, whatever they do
 
 
 def group_flowers(
@@ -56,8 +56,7 @@ def group_flowers(
         return _numbered(kmeans2(places, min(config.n_clusters, n), minit="++", rng=rng)[1])
     if n == 1:
         return np.zeros(1, dtype=np.int64)
-    spacing = _spacing(places)
-    evidence = None if motion is None else motion_evidence(places, motion, _REACH * spacing)
+    evidence = None if motion is None else motion_evidence(places, motion, REACH * spacing_of(places))
     tree = _tree(places, evidence, "single" if config.method == "branch" else "average")
     if config.linkage_m is not None:
         return _numbered(fcluster(tree, config.linkage_m, "distance"))
@@ -65,7 +64,7 @@ def group_flowers(
     label = likeliest_cut(tree, likelihood)
     if config.method == "spacing":
         label = improve(label, likelihood)
-    return _numbered(label) if _come_in_clusters(places, presence, label, likelihood) else np.arange(n)
+    return _numbered(label) if come_in_clusters(label, likelihood, _seen_together(places, presence)) else np.arange(n)
 
 
 def _numbered(label: NDArray[Any]) -> IntArray:
@@ -76,23 +75,28 @@ def _numbered(label: NDArray[Any]) -> IntArray:
     return rank[inverse]
 
 
-def _spacing(places: Array) -> float:
+def spacing_of(places: Array) -> float:
     """Median distance of a flower to its nearest, m."""
     return float(np.median(np.asarray(cKDTree(places).query(places, k=2)[0])[:, 1]))
 
 
 def _tree(places: Array, evidence: csr_matrix | None, method: Literal["single", "average"]) -> Array:
-    """Linkage tree of distances, which evidence against common motion stretches and evidence for it shrinks."""
-    distance = np.linalg.norm(places[:, None] - places[None], axis=-1)
-    if evidence is not None:
-        pairs = evidence.tocoo()
-        distance[pairs.row, pairs.col] *= np.interp(pairs.data, [-2.0, 0.0, 2.0], [2.5, 1.0, 0.8])
-    tree: Array = linkage(squareform(distance, checks=False), method)
+    """Linkage tree of stretched distances."""
+    tree: Array = linkage(squareform(stretched_distances(places, evidence), checks=False), method)
     return tree
 
 
-def _come_in_clusters(places: Array, presence: csr_matrix, label: IntArray, likelihood: Likelihood) -> bool:
-    """Whether this session's flowers come in clusters at all.
+def stretched_distances(places: Array, evidence: csr_matrix | None) -> Array:
+    """Distances (l, l) of flowers, which evidence against common motion stretches and evidence for it shrinks."""
+    distance: Array = np.linalg.norm(places[:, None] - places[None], axis=-1)
+    if evidence is not None:
+        pairs = evidence.tocoo()
+        distance[pairs.row, pairs.col] *= np.interp(pairs.data, [-2.0, 0.0, 2.0], [2.5, 1.0, 0.8])
+    return distance
+
+
+def come_in_clusters(label: IntArray, likelihood: Likelihood, together: float) -> bool:
+    """Whether this session's flowers come in clusters at all; ``together`` is how often neighbours are seen so.
 
     They do where they stand nearer than flowers that are all loose would, and are seen together: things that stand in
     groups, but do not belong together, hide each other or face another way. Where they are seldom seen together they
@@ -101,9 +105,9 @@ def _come_in_clusters(places: Array, presence: csr_matrix, label: IntArray, like
     clustered = likelihood.sums(members_by_label(label).values())
     if clustered.motion > _SURE:
         return True
-    if likelihood.of(clustered) - likelihood(np.arange(len(places))) < _LIKELIER:
+    if likelihood.of(clustered) - likelihood(np.arange(len(label))) < _LIKELIER:
         return False
-    doubt = -_of_clusters(_seen_together(places, presence))
+    doubt = -_of_clusters(together)
     return doubt <= 0.0 or clustered.motion > doubt
 
 

@@ -124,6 +124,8 @@ class Likelihood:
         """Evidence of the pairs of one cluster's members (k,), sorted."""
         within = np.ix_(members, members)
         known = self.known[within]
+        if not known.any():
+            return 0.0
         if len(members) > _SMALL:
             of = connected_components(csr_matrix(known.astype(np.int8)), directed=False)[1]
         else:

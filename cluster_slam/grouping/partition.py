@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import squareform
 
 from cluster_slam.geometry import Array
 from cluster_slam.grouping.likelihood import Likelihood, members_by_label
@@ -12,31 +13,51 @@ from cluster_slam.records import IntArray
 
 _NEIGHBOURS = 6  # whose clusters a flower may move to
 _MAX_SWEEPS = 10
+_LEAST_GAIN = 1e-9  # log-likelihood
 
 Change = tuple[IntArray, int]  # these flowers of one cluster, sorted, get that label
 
 
 def likeliest_cut(tree: Array, likelihood: Likelihood) -> IntArray:
     """Of all cuts of a linkage tree the likeliest."""
-    nodes = [np.array([i], dtype=np.int64) for i in range(len(tree) + 1)]
-    sums = likelihood.sums(nodes)
-    best, best_score = -1.0, likelihood.of(sums)
-    height = tree[:, 2]
-    for i, (a, b) in enumerate(tree[:, :2].astype(np.int64).tolist()):
-        nodes.append(np.sort(np.concatenate([nodes[a], nodes[b]])))
-        sums = likelihood.changed(sums, (nodes[a], nodes[b]), nodes[-1:])
-        is_cut = i + 1 == len(tree) or height[i + 1] > height[i] * (1.0 + 1e-12)
-        if is_cut and (score := likelihood.of(sums)) > best_score:
-            best, best_score = float(height[i]) * (1.0 + 1e-12), score
-    if best < 0.0:
-        return np.arange(len(nodes) // 2 + 1, dtype=np.int64)
-    return fcluster(tree, best, "distance").astype(np.int64) - 1
+    cuts = Cuts(tree, likelihood)
+    cuts.work(len(tree))
+    return cuts.label
+
+
+class Cuts:
+    """All cuts of a linkage tree, tried from the leaves up."""
+
+    def __init__(self, tree: Array, likelihood: Likelihood) -> None:
+        self.tree, self.likelihood = tree, likelihood
+        self._nodes = [np.array([i], dtype=np.int64) for i in range(len(tree) + 1)]
+        self._sums = likelihood.sums(self._nodes)
+        self._height, self.score = -1.0, likelihood.of(self._sums)
+
+    def work(self, n_merges: int) -> bool:
+        """Try the cuts above so many merges more; whether all have been tried."""
+        tree, nodes, height = self.tree, self._nodes, self.tree[:, 2]
+        begin = len(nodes) - len(tree) - 1
+        for i, (a, b) in enumerate(tree[begin : begin + n_merges, :2].astype(np.int64).tolist(), begin):
+            nodes.append(np.sort(np.concatenate([nodes[a], nodes[b]])))
+            self._sums = self.likelihood.changed(self._sums, (nodes[a], nodes[b]), nodes[-1:])
+            is_cut = i + 1 == len(tree) or height[i + 1] > height[i] * (1.0 + 1e-12)
+            if is_cut and (score := self.likelihood.of(self._sums)) > self.score:
+                self._height, self.score = float(height[i]) * (1.0 + 1e-12), score
+        return begin + n_merges >= len(tree)
+
+    @property
+    def label(self) -> IntArray:
+        """Clusters (l,) of the likeliest so far."""
+        if self._height < 0.0:
+            return np.arange(len(self.tree) + 1, dtype=np.int64)
+        return fcluster(self.tree, self._height, "distance").astype(np.int64) - 1
 
 
 def improve(label: IntArray, likelihood: Likelihood) -> IntArray:
     """Move single flowers, join neighbours and split clusters as long as that makes the partition likelier."""
-    partition = _Partition(label, likelihood)
-    neighbours = _neighbours(likelihood.places)
+    partition = Partition(label, likelihood)
+    neighbours = neighbours_of(likelihood.places)
     for _ in range(_MAX_SWEEPS):
         before = partition.score
         for f in range(len(label)):
@@ -44,24 +65,28 @@ def improve(label: IntArray, likelihood: Likelihood) -> IntArray:
         for a in list(partition.members):
             partition.try_each(partition.splits(a))
             partition.try_each(partition.joins(a, neighbours))
-        if partition.score <= before + 1e-9:
+        if partition.score <= before + _LEAST_GAIN:
             break
     return partition.label
 
 
-class _Partition:
-    """A partition that changes: labels (l,), members by label, and its log-likelihood."""
+class Partition:
+    """A partition that changes: labels (l,), members by label, and its log-likelihood.
 
-    def __init__(self, label: IntArray, likelihood: Likelihood) -> None:
+    Clusters are split where ``distance`` (l, l) is widest, where they stand if that is not given.
+    """
+
+    def __init__(self, label: IntArray, likelihood: Likelihood, distance: Array | None = None) -> None:
         self.label = label.copy()
         self.members = members_by_label(label)
         self.likelihood = likelihood
         self.sums = likelihood.sums(self.members.values())
         self.score = likelihood.of(self.sums)
+        self.distance = distance
 
     def try_each(self, changes: list[Change]) -> None:
         """Carry out the change that helps most, if any."""
-        best, score = None, self.score + 1e-9
+        best, score = None, self.score + _LEAST_GAIN
         for flowers, new in changes:
             gone, come = self._replaced(flowers, new)
             sums = self.likelihood.changed(self.sums, gone, come)
@@ -90,7 +115,11 @@ class _Partition:
         if a not in self.members or len(self.members[a]) < 4:
             return []
         mine = self.members[a]
-        half = fcluster(linkage(self.likelihood.places[mine], "average"), 2, "maxclust")
+        if self.distance is None:
+            tree = linkage(self.likelihood.places[mine], "average")
+        else:
+            tree = linkage(squareform(self.distance[np.ix_(mine, mine)], checks=False), "average")
+        half = fcluster(tree, 2, "maxclust")
         return [(mine[half == 2], self._new_label())]
 
     def _new_label(self) -> int:
@@ -99,7 +128,7 @@ class _Partition:
     def _replaced(self, flowers: IntArray, new: int) -> tuple[list[IntArray], list[IntArray]]:
         """Clusters that are gone after a change, and those that come for them."""
         old = self.members[int(self.label[flowers[0]])]
-        left = old[~np.isin(old, flowers)]
+        left = old[old != flowers[0]] if len(flowers) == 1 else old[~np.isin(old, flowers)]
         gone, come = [old], [left] if len(left) else []
         if new not in self.members:
             return gone, [*come, flowers]
@@ -115,6 +144,7 @@ class _Partition:
             del self.members[old]
 
 
-def _neighbours(places: Array) -> IntArray:
+def neighbours_of(places: Array) -> IntArray:
+    """The nearest flowers (l, k) of each, to whose clusters it may move."""
     k = min(_NEIGHBOURS + 1, len(places))
     return np.asarray(cKDTree(places).query(places, k=k)[1])[:, 1:].astype(np.int64)

@@ -42,6 +42,7 @@ _TRACKS_S = 0.1
 _TEXTS = ("revisions.txt", "warnings.txt")
 _OURS = (
     "cluster_slam.online.",
+    "cluster_slam.grouping.",
     "cluster_slam.graph.incremental",
     "cluster_slam.config",
     "cluster_slam.records",

@@ -36,7 +36,7 @@ def live(world: World, seen: Seen, view: View, T: Array, w: Array) -> tuple[IntA
     match_tentative(world, seen, view, T, w, row_of)
     count_hits(world, row_of[row_of >= 0], view.stamp)
     missing = count_misses(world, seen.at, T, view.c, row_of[row_of >= 0])
-    note_motion(world, seen, w, view.S, view.number)
+    note_motion(world, seen, w, view)
     reasons = np.where(row_of >= 0, int(RejectReason.ACCEPTED), int(RejectReason.POSITION_GATE))
     bear(world, seen, view, T, w, row_of, reasons, missing)
     world.births.note_view(view.stamp, T)
@@ -173,13 +173,13 @@ def is_hidden(p: Array, c: Array, radius: float) -> BoolArray:
     return hidden
 
 
-def note_motion(world: World, seen: Seen, w: Array, S: Array, number: int) -> None:
+def note_motion(world: World, seen: Seen, w: Array, view: View) -> None:
     """Who was seen together, and who moved together."""
     if not len(seen.rows):
         return
-    u = w[seen.cols] - world.flowers.place[seen.rows]
-    var = np.trace(S[seen.cols], axis1=1, axis2=2) / 3.0 + np.trace(seen.pose.cov[3:, 3:]) / 3.0
-    world.grouping.observe(world.flowers.seat[seen.rows], u, var)
+    table, rows = world.flowers, seen.rows
+    var = np.trace(view.S[seen.cols], axis1=1, axis2=2) / 3.0 + np.trace(seen.pose.cov[3:, 3:]) / 3.0
+    world.grouping.observe(view.stamp, table.seat[rows], w[seen.cols], var, table.place[rows])
 
 
 def confirm(world: World, seen: Seen, stamp: float) -> None:

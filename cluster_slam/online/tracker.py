@@ -17,7 +17,7 @@ from cluster_slam.online.life import forget, live
 from cluster_slam.online.odometry import diagonal, step_cov
 from cluster_slam.online.records import Tracks, Update
 from cluster_slam.online.tracks import tracks_of
-from cluster_slam.online.upkeep import merge_doubles, regroup, solve_all, solve_near, tell_lost
+from cluster_slam.online.upkeep import carry_on, merge_doubles, regroup, solve_all, solve_near, tell_lost
 from cluster_slam.online.watch import AstrayWatch, MountWatch, NoiseWatch
 from cluster_slam.online.world import World
 from cluster_slam.records import Calibration, Frame, IntArray, PoseError, RejectReason, StatedNoise
@@ -165,8 +165,10 @@ class OnlineTracker:
             self.last_solve = stamp
             merge_doubles(world)
         patience = config.keyframe_s if world.grouping.is_stale else config.regroup_s
-        if stamp - self.last_group >= patience:
-            regroup(world, stamp)
+        if world.grouping.round is not None:
+            carry_on(world, stamp)
+        elif stamp - self.last_group >= patience:
+            regroup(world, stamp, self.last_group)
             self.last_group = stamp
         tell_lost(world, stamp)
 

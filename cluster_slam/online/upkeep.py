@@ -6,7 +6,7 @@ import numpy as np
 
 from cluster_slam.geometry import Array
 from cluster_slam.online.world import World
-from cluster_slam.records import IntArray
+from cluster_slam.records import BoolArray, IntArray
 
 _FEW_LOOKS = 2  # of each of two landmarks, before it is believed that they are never seen together
 _TOGETHER = 0.15  # share of the rarer one's looks that saw both: two flowers
@@ -72,17 +72,39 @@ def merge_doubles(world: World) -> None:
     world.drop(gone)
 
 
-def regroup(world: World, stamp: float) -> None:
-    """Group all flowers again; each group keeps the id of the cluster that most of it came from."""
+def regroup(world: World, stamp: float, since: float) -> None:
+    """Begin to group all flowers again, or do so at once; those not seen ``since`` then are not asked."""
     table = world.flowers
-    world.grouping.is_stale = False
     rows = np.flatnonzero(table.confirmed)
     if len(rows) < 2:
         return
+    seats, places, volume = table.seat[rows], table.place[rows], world.view_volume()
+    label = world.grouping.at_once(seats, places, volume, np.random.default_rng(world.seed))
+    if label is not None:
+        regrouped(world, rows, label, stamp)
+        return
+    asked: BoolArray = table.last[rows] >= since
+    world.grouping.begin(table.ids[rows], seats, places, table.slot[rows], volume, asked)
+
+
+def carry_on(world: World, stamp: float) -> None:
+    """A round of the grouping goes on, and at last has its say."""
+    if world.grouping.round is None:
+        return
+    table = world.flowers
+    confirmed = np.flatnonzero(table.confirmed)
+    row_of = dict(zip(table.ids[confirmed].tolist(), confirmed.tolist(), strict=True))
+    found = world.grouping.carry_on({i: int(table.seat[row]) for i, row in row_of.items()})
+    if found is not None and len(found[0]):
+        ids, label = found
+        regrouped(world, np.array([row_of[i] for i in ids.tolist()], dtype=np.int64), label, stamp)
+
+
+def regrouped(world: World, rows: IntArray, label: IntArray, stamp: float) -> None:
+    """Flowers (l,) are in these clusters; each keeps the id of the cluster that most of it came from."""
+    table = world.flowers
     old = table.slot[rows]
-    label = world.grouping.group(
-        table.seat[rows], table.place[rows], old, world.view_volume(), np.random.default_rng(world.seed)
-    )
+    label = np.unique(label, return_inverse=True)[1].astype(np.int64)
     weight = np.zeros((int(label.max()) + 1, len(world.clusters)))
     np.add.at(weight, (label, old), 1.0)
     if ((weight > 0).sum(0) <= 1).all() and ((weight > 0).sum(1) <= 1).all():
@@ -90,10 +112,12 @@ def regroup(world: World, stamp: float) -> None:
     slot_of = keep_names(world, weight, stamp)
     before = table.slot.copy()
     table.slot[rows] = slot_of[label]
+    left_out = np.ones(len(table), dtype=bool)
+    left_out[rows] = False
     for s in np.unique(old).tolist():
         if not (table.slot[rows] == s).any():
             to = int(np.bincount(table.slot[rows[old == s]]).argmax())
-            table.slot[(before == s) & ~table.confirmed] = to
+            table.slot[(before == s) & left_out] = to
             a, b = world.clusters[s], world.clusters[to]
             b.first, b.n = min(a.first, b.first), a.n + b.n
             world.merged_clusters.append((a.id, b.id))

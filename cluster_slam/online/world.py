@@ -47,6 +47,7 @@ class World:
         self.merged_clusters: list[tuple[int, int]] = []
         self.revisions: list[Revision] = []  # of the present frame
         self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)  # of x / z, y / z and z of all points so far
+        self.most_points = 2  # in one frame
         self.spacing = np.inf  # m, how close flowers stand
         self.births = Births()
         self.met: dict[int, set[int]] = {}  # landmarks that were seen together with a flower without an id as yet
@@ -101,6 +102,7 @@ class World:
     def widen_view(self, c: Array) -> None:
         """Points (q, 3) of the camera frame have been seen: this far it sees at least."""
         if len(c):
+            self.most_points = max(self.most_points, len(c))
             rays = np.column_stack([c[:, 0] / c[:, 2], c[:, 1] / c[:, 2], c[:, 2]])
             self.low, self.high = np.minimum(self.low, rays.min(0)), np.maximum(self.high, rays.max(0))
 
@@ -131,12 +133,16 @@ class World:
         return float(0.5 * (self.low[2] + self.high[2])) if np.isfinite(self.low[2]) else 0.0
 
     def view_volume(self) -> float:
-        """How much space one look holds, m^3."""
+        """How much space one look holds, m^3.
+
+        The range of n points that lie anywhere is (n - 1) / (n + 1) of the range in which they may.
+        """
         if not np.isfinite(self.low).all():
             return 1.0
         depth = self.view_depth()
         width, height = np.maximum(self.high - self.low, 0.1)[:2] * depth
-        return float(width * height * depth)
+        unseen = (self.most_points + 1.0) / (self.most_points - 1.0)
+        return float(unseen**2 * width * height * depth)
 
     def note_unclaimed(self, n: int) -> None:
         """So many points of a frame belong to no known flower."""
