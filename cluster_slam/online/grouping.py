@@ -19,7 +19,7 @@ _FEWEST = 3  # members of what is called a cluster
 _ROOM = 64  # seats, at first; they double
 _ENOUGH_LOOKS = 10  # before it can be said that neighbours are not seen together
 _MANY_NEW = 0.05  # share of new flowers from which on all is grouped from scratch, too
-_CHANGES = 35  # of clusters that are tried in one frame
+_CHANGES = 1500.0  # of clusters that are tried in a second
 
 
 class OnlineGrouping:
@@ -84,10 +84,13 @@ class OnlineGrouping:
         self.round = Round(ids, places, now, volume, evidence, asked, is_other)
         self._known = ids
 
-    def carry_on(self, seat_of: dict[int, int]) -> tuple[IntArray, IntArray] | None:
-        """A few changes more; flowers and clusters 0..c-1 (l,) of those that live (``seat_of``), when all is done."""
+    def carry_on(self, seat_of: dict[int, int], dt: float) -> tuple[IntArray, IntArray] | None:
+        """A few changes more, as ``dt`` s from frame to frame leave time for.
+
+        Flowers and clusters 0..c-1 (l,) of those that live (``seat_of``), when all is done.
+        """
         going = self.round
-        if going is None or not going.work(_CHANGES):
+        if going is None or not going.work(max(1, round(_CHANGES * dt))):
             return None
         self.round = None
         alive = np.array([i in seat_of for i in going.ids.tolist()], dtype=bool)

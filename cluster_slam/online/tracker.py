@@ -154,23 +154,30 @@ class OnlineTracker:
         """Forget what was none, solve the map, group again, say who is lost."""
         world, config = self.world, self.config
         forget(world)
-        if len(world.map) and stamp - self.last_solve >= config.keyframe_s:
-            if not world.map.is_frozen:
-                self._calibrate(stamp)
-            elif stamp - self.last_all >= _ALL_S:
-                solve_all(world)
-                self.last_all = stamp
-            else:
-                solve_near(world, stamp, self.last_solve)
-            self.last_solve = stamp
-            merge_doubles(world)
         patience = config.keyframe_s if world.grouping.is_stale else config.regroup_s
+        if len(world.map) and stamp - self.last_solve >= config.keyframe_s:
+            self._solve(stamp)
+            merge_doubles(world)
+            if world.usual_dt < 0.5 * config.keyframe_s:  # frames come quickly: none shall be late
+                tell_lost(world, stamp)
+                return
         if world.grouping.round is not None:
             carry_on(world, stamp)
         elif stamp - self.last_group >= patience:
             regroup(world, stamp, self.last_group)
             self.last_group = stamp
         tell_lost(world, stamp)
+
+    def _solve(self, stamp: float) -> None:
+        """The map: all of it, or what was seen lately."""
+        if not self.world.map.is_frozen:
+            self._calibrate(stamp)
+        elif stamp - self.last_all >= _ALL_S:
+            solve_all(self.world)
+            self.last_all = stamp
+        else:
+            solve_near(self.world, stamp, self.last_solve)
+        self.last_solve = stamp
 
     def _calibrate(self, stamp: float) -> None:
         """The hand-eye transform is one more unknown of the map, until it has been estimated for long enough."""

@@ -94,7 +94,7 @@ def carry_on(world: World, stamp: float) -> None:
     table = world.flowers
     confirmed = np.flatnonzero(table.confirmed)
     row_of = dict(zip(table.ids[confirmed].tolist(), confirmed.tolist(), strict=True))
-    found = world.grouping.carry_on({i: int(table.seat[row]) for i, row in row_of.items()})
+    found = world.grouping.carry_on({i: int(table.seat[row]) for i, row in row_of.items()}, world.usual_dt)
     if found is not None and len(found[0]):
         ids, label = found
         regrouped(world, np.array([row_of[i] for i in ids.tolist()], dtype=np.int64), label, stamp)
