@@ -14,6 +14,7 @@ from cluster_slam.localisation.instruments import news_of, put_right
 from cluster_slam.localisation.landmarks import Landmarks, landmarks
 from cluster_slam.localisation.motion import motion_of
 from cluster_slam.localisation.planar import flat_world
+from cluster_slam.localisation.vehicle import FlatFollower
 from cluster_slam.pipeline.localise import localise
 from cluster_slam.records import Observations, Session, StatedNoise
 
@@ -124,3 +125,70 @@ def test_one_point_leaves_every_heading_and_side_open() -> None:
     lever = np.hypot(3.0, 0.5)
     sigma = np.sqrt(2 * 0.01**2 + (0.03 * lever) ** 2 + 0.05**2 + (np.pi / 72 * lever) ** 2)
     np.testing.assert_allclose(away, sigma, rtol=0.01)
+
+
+def follower_of(session: Session, marks: Landmarks) -> FlatFollower:
+    motion = motion_of(session)
+    flat = flat_world(session, motion, marks)
+    assert flat is not None
+    return FlatFollower(flat, marks, motion, np.random.default_rng(5))
+
+
+def test_a_place_is_as_wide_as_it_is_stated_and_two_places_stay_two() -> None:
+    """Beliefs that are normally distributed are one place, also where that is wider than landmarks are apart."""
+    session, _, marks = drive(20, np.random.default_rng(6))
+    follower, rng, n = follower_of(session, marks), np.random.default_rng(7), 2000
+    mean = np.zeros((n, 5))
+    mean[:, :3] = rng.normal(size=(n, 3)) * [3.0, 2.0, 0.2]
+    own = np.tile(np.diag([0.1, 0.1, 0.01, 1e-4, 1e-4]) ** 2, (n, 1, 1))
+    one = Beliefs(mean, own, np.ones(n), np.zeros(n))
+    assert follower._mode(one, one.weights).mean() > 0.97  # 0.99 of the Gaussian itself
+    apart = mean * [0.1, 0.1, 0.1, 1.0, 1.0]
+    apart[: n // 4, 0] += 8.0
+    two = Beliefs(apart, own, np.ones(n), np.zeros(n))
+    assert follower._mode(two, two.weights).mean() == pytest.approx(0.75, abs=0.01)
+
+
+def test_all_is_not_begun_from_a_point_that_nothing_follows() -> None:
+    session, _, marks = drive(20, np.random.default_rng(8))
+    follower = follower_of(session, marks)
+    assert follower._beginning(np.array([1.0])) == -1
+    assert follower._beginning(np.array([1.0, 0.2, 1.0])) == 1
+    assert [follower._beginning(np.ones(1)) for _ in range(6)] == [-1] * 5 + [0]
+    assert follower._beginning(np.zeros(0)) == -1
+
+
+def test_who_stands_elsewhere_is_not_sure_for_long_and_finds_back() -> None:
+    """All beliefs in one wrong place: what is begun beside them explains the points better and replaces them."""
+    session, true, marks = drive(160, np.random.default_rng(9))
+    follower, o = follower_of(session, marks), session.observations
+    off = np.full(session.n_frames, np.nan)
+    for i in range(session.n_frames):
+        rows = np.flatnonzero(o.frame == i)
+        if i == 60:
+            assert follower.beliefs is not None
+            follower.beliefs.mean[:, :3] += [3.0, -2.0, 2.0]
+        place = follower.step(i, o.points[rows], o.covs[rows], np.full(len(rows), 0.3))
+        if place.reason == "":
+            off[i] = np.linalg.norm(place.T_map_camera[:3, 3] - true[i, :3, 3])
+    assert np.nanmax(off[:60]) < 0.5
+    assert (off[60:] > 0.5).sum() <= 20  # points until a doubt
+    assert (off[-30:] < 0.3).mean() > 0.8
+
+
+def test_the_likelihood_of_a_point_is_that_of_all_beliefs_together() -> None:
+    q, S = np.array([3.0, 0.5]), np.diag([0.1, 0.1]) ** 2
+    beliefs = everywhere(np.array([2.0, 0.1]), S, PLACES)
+    w = np.random.default_rng(10).random(len(beliefs))
+    beliefs.log_weight = np.log(w)
+    upright = beliefs.side > 0
+    marks = np.where(upright[:, None, None], PLACES, PLACES * [1.0, -1.0])
+    off, _, HPH = beliefs.views(np.arange(len(beliefs)), q, marks)
+    total = np.zeros(len(beliefs))
+    for share, factor in ((0.9, 1.0), (0.1, 16.0)):
+        C = HPH + factor * S
+        d2 = np.einsum("nki,nki->nk", off, np.linalg.solve(C, off[..., None])[..., 0])
+        total += 0.97 * share * (np.exp(-0.5 * d2) / (2.0 * np.pi * np.sqrt(np.linalg.det(C)))).mean(1)
+    expected = np.log((w / w.sum()) @ (total + 0.03 / 50.0))
+    _, got = beliefs.see(q, S, 1.0, PLACES, 50.0, np.random.default_rng(11))
+    assert got == pytest.approx(expected)

@@ -61,15 +61,22 @@ class Beliefs:
         Q[:, [3, 4], [3, 4]] = (_WANDER * np.array([_GAIN, _OFFSET])) ** 2
         self.cov = F @ self.cov @ np.swapaxes(F, 1, 2) + Q
 
-    def see(self, q: Array, S: Array, news: float, places: Array, area: float, rng: np.random.Generator) -> Array:
+    def see(
+        self, q: Array, S: Array, news: float, places: Array, area: float, rng: np.random.Generator
+    ) -> tuple[Array, float]:
         """Take a point q (2,) with covariance S (2, 2) in, which counts as so much of an independent one.
 
-        Each belief draws which landmark (k, 2) it is, or none. Returns the probability of none (n,) for each belief.
+        Each belief draws which landmark (k, 2) it is, or none. Returns the probability of none (n,) for each belief,
+        and the log likelihood of the point under all of them.
         """
-        none = np.empty(len(self))
+        none, before = np.empty(len(self)), self._log_total()
         for rows in np.array_split(np.arange(len(self)), 1 + len(self) * len(places) // _MOST_PAIRS):
             none[rows] = self._see(rows, q, S, news, places, area, rng)
-        return none
+        return none, self._log_total() - before
+
+    def _log_total(self) -> float:
+        most = float(self.log_weight.max())
+        return most + float(np.log(np.exp(self.log_weight - most).sum()))
 
     def _see(
         self, rows: IntArray, q: Array, S: Array, news: float, places: Array, area: float, rng: np.random.Generator
