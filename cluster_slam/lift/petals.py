@@ -20,7 +20,7 @@ from cluster_slam.sensors.depth import DepthModel
 _INNER = 0.95  # share of the box that is looked at: an ellipse
 _CENTRED = 0.55  # sigma of the weight that falls from the middle, in half-axes
 _TILT = 0.7  # sigma of the tangent of a flower's tilt
-_RELIEF = 0.07  # sigma of petals about a plane, in half widths of the flower
+_RELIEF = 0.055  # sigma of petals about a plane, in half widths of the flower
 _DEEP = (0.3, 0.9)  # depth of a flower, in widths: one that faces the camera, and one that does not
 _GOES_ON = 1.2  # weight of what goes on beyond the box, in depth ...
 _THIN = 3.0  # ... and in colour: a stem has this many times its share of the ring in the box
@@ -29,7 +29,7 @@ _MIN_SCORE = 0.15  # of the petals: their weight in the box less their share of 
 _ALL = 0.85  # of the weight in the box: what holds so much has no rival ...
 _MIN_ALL = 0.3  # ... if it is so much of a whole box
 _DOUBT = 0.3  # a rival that scores so much of the best leaves no depth
-_TUKEY = 4.0  # sigmas at which a pixel counts no more
+_TUKEY = 3.0  # sigmas at which a pixel counts no more
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +80,8 @@ def petal_depth(
     petals = _petals(patch, width_px / focal_px, model)
     if petals.sum() < 3:
         return NO_DEPTH
-    u, v, z, weight = patch.u[petals], patch.v[petals], patch.z[petals], patch.weight[petals]
-    return replace(_plane(u, v, z, weight, width_px, focal_px, model), seen=float(petals.sum()) / patch.area)
+    u, v, z = patch.u[petals], patch.v[petals], patch.z[petals]
+    return replace(_plane(u, v, z, width_px, focal_px, model), seen=float(petals.sum()) / patch.area)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,10 +171,11 @@ def _petals(patch: _Patch, width: float, model: DepthModel) -> BoolArray:
     return chosen
 
 
-def _plane(
-    u: Array, v: Array, z: Array, weight: Array, width_px: float, focal_px: float, model: DepthModel
-) -> PetalDepth:
-    """Depth at the middle, its sigma, and the slopes, by least squares that let go of what does not fit."""
+def _plane(u: Array, v: Array, z: Array, width_px: float, focal_px: float, model: DepthModel) -> PetalDepth:
+    """Depth at the middle, its sigma, and the slopes, by least squares that let go of what does not fit.
+
+    All petals count alike: of a flower that is a cup the middle lies behind the rest.
+    """
     middle = float(np.median(z))
     noise = float(model.sigma(np.array([middle]))[0])
     relief = _RELIEF * 0.5 * width_px * middle / focal_px
@@ -186,8 +187,8 @@ def _plane(
     robust = np.ones(len(z))
     solution = np.array([middle, 0.0, 0.0])
     for _ in range(4):
-        A = X.T @ (X * (robust * weight / weight.mean())[:, None]) * (share / noise_var) + prior
-        y = X.T @ (z * robust * weight / weight.mean()) * (share / noise_var)
+        A = X.T @ (X * robust[:, None]) * (share / noise_var) + prior
+        y = X.T @ (z * robust) * (share / noise_var)
         solution = np.linalg.solve(A, y)
         residual = z - X @ solution
         scale = max(float(np.hypot(noise, relief)), 1.4826 * float(np.median(np.abs(residual))))
