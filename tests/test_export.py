@@ -92,6 +92,16 @@ def test_pictures_go_through_bit_by_bit(tmp_path: Path, ending: str) -> None:
     assert "scale = 0.0002" in text
 
 
+def test_the_unit_of_depth_goes_through_a_tum_folder(tmp_path: Path) -> None:
+    """A session in millimetres: read as TUM's 0.2 mm, everything would be five times too near."""
+    source = session_of_pictures(tmp_path)
+    text = (source / "session.toml").read_text()
+    (source / "session.toml").write_text(text.replace("scale = 0.0002", "scale = 0.001"))
+    assert run(["export", str(source), "-o", str(tmp_path / "middle"), "--quiet"]) == 0
+    assert run(["import", str(tmp_path / "middle"), "-o", str(tmp_path / "back"), "--quiet"]) == 0
+    assert "scale = 0.001\n" in (tmp_path / "back" / "session.toml").read_text()
+
+
 def test_a_trajectory_as_tum(tmp_path: Path) -> None:
     """Of the camera: the mount is multiplied in."""
     assert run(["export", str(SAMPLE), "-o", str(tmp_path / "t.txt"), "--quiet"]) == 0

@@ -8,7 +8,8 @@ from pathlib import Path
 from cluster_slam.errors import InputError
 from cluster_slam.geometry import tum_from_pose
 from cluster_slam.io.importers.poses import read_pose_file
-from cluster_slam.io.importers.session_files import new_folder, trajectory
+from cluster_slam.io.importers.session_files import SessionHead, new_folder, session_toml, trajectory
+from cluster_slam.io.metadata import read_metadata
 from cluster_slam.records import Session
 
 _COPIED = ("rgb.txt", "depth.txt", "camera.yaml")
@@ -25,6 +26,8 @@ def camera_trajectory(session: Session, folder: Path) -> str:
 def export_tum(session: Session, folder: Path, out: Path) -> int:
     """Write ``groundtruth.txt``, and the images with their lists where there are any; how many were copied.
 
+    Images stay as they are; their unit of depth, which need not be TUM's 0.2 mm, stands in a ``session.toml`` beside.
+
     Raises
     ------
     InputError
@@ -39,12 +42,28 @@ def export_tum(session: Session, folder: Path, out: Path) -> int:
         for name in _COPIED:
             if (folder / name).is_file():
                 shutil.copyfile(folder / name, new / name)
+        if (new / "depth.txt").is_file():
+            (new / "session.toml").write_text(_head(session, folder), "utf-8")
         for image in listed_images(folder):
             target = new / image.relative_to(folder)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(image, target)
             n_images += 1
     return n_images
+
+
+def _head(session: Session, folder: Path) -> str:
+    """``session.toml`` of the camera's trajectory and its depth images."""
+    metadata, _ = read_metadata(folder / "session.toml")
+    head = SessionHead(
+        id=session.id,
+        plant=session.plant,
+        pose_error=session.pose_error,
+        max_time_difference_s=metadata.frames.max_time_difference,
+        depth_scale=metadata.depth.scale,
+        depth_camera=metadata.depth.camera,
+    )
+    return session_toml(head)
 
 
 def listed_images(folder: Path) -> list[Path]:
