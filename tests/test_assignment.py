@@ -47,6 +47,20 @@ def test_components_change_nothing(r: int, c: int, seed: int) -> None:
     assert len(set(rows.tolist())) == len(rows)
 
 
+@settings(max_examples=30)
+@given(st.integers(1, 30), st.integers(1, 30), st.integers(0, 2**32 - 1))
+def test_pairs_had_at_once_change_nothing(r: int, c: int, seed: int) -> None:
+    """Among many that no other competes with."""
+    cost = np.random.default_rng(seed).uniform(0, 20, (r, c))
+    gain = np.minimum(cost - 1.0, 0.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "SPLIT_ABOVE", 3)
+        rows, cols = module._split(gain)
+    assert (gain[rows, cols] < 0.0).all()
+    assert gain[rows, cols].sum() == pytest.approx(gain[module._solve(gain)].sum(), abs=1e-12)
+    assert len(set(rows.tolist())) == len(rows) == len(set(cols.tolist()))
+
+
 def test_a_large_sparse_problem_is_split_and_quick() -> None:
     rng = np.random.default_rng(0)
     cost = np.where(rng.random((600, 700)) < 0.002, rng.random((600, 700)), np.inf)

@@ -44,7 +44,7 @@ def assign(cost: Array, max_cost: float) -> tuple[IntArray, IntArray]:
     gain = np.where(cost < max_cost, cost, max_cost) - max_cost  # NaN compares false
     if np.isneginf(gain).any():
         raise ParameterError("a cost of -inf leaves nothing to compare")
-    rows, cols = _by_components(gain) if gain.size > SPLIT_ABOVE else _solve(gain)
+    rows, cols = _split(gain)
     order = np.argsort(rows, kind="stable")
     return rows[order], cols[order]
 
@@ -60,6 +60,18 @@ def _solve(gain: Array) -> tuple[IntArray, IntArray]:
     rows, cols = linear_sum_assignment(gain)
     useful = gain[rows, cols] < 0.0
     return rows[useful].astype(np.int64), cols[useful].astype(np.int64)
+
+
+def _split(gain: Array) -> tuple[IntArray, IntArray]:
+    """Pairs that no other competes with are had at once; what is left of a large problem is far smaller. Exact."""
+    if gain.size <= SPLIT_ABOVE:
+        return _solve(gain)
+    i, j = np.nonzero(gain)
+    alone = (np.bincount(i, minlength=1)[i] == 1) & (np.bincount(j, minlength=1)[j] == 1)
+    rows, cols = np.unique(i[~alone]), np.unique(j[~alone])
+    rest = gain[np.ix_(rows, cols)]
+    r, c = _by_components(rest) if rest.size > SPLIT_ABOVE else _solve(rest)
+    return np.concatenate([i[alone], rows[r]]), np.concatenate([j[alone], cols[c]])
 
 
 def _by_components(gain: Array) -> tuple[IntArray, IntArray]:

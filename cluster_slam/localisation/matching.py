@@ -60,11 +60,12 @@ def _in_reach(
     """The flowers of those clusters of which one at least may be near a point, and their places."""
     R, marks = state.V[:3, :3], state.marks
     J = np.concatenate([-R @ skew(look.points[points]), np.broadcast_to(R, (len(points), 3, 3))], axis=-1)
-    by_pose = float(np.einsum("nia,ab,nib->n", J, state.P[:6, :6], J).max())
+    by_pose = float(((J @ state.P[:6, :6]) * J).sum((1, 2)).max())
     own = float(np.trace(point_covs, axis1=1, axis2=2).max())
     reach = GATE_CHI2 * (2.0 * by_pose + 2.0 * state.most_off(sway_m) + own)
-    near = (((seen[:, None] - places) ** 2).sum(-1) < reach).any(0)
-    kept = np.isin(marks.cluster[flowers], marks.cluster[flowers[near]])
+    close = np.zeros(marks.n_clusters, bool)
+    close[marks.cluster[flowers[(_apart_sq(seen, places) < reach).any(0)]]] = True
+    kept = close[marks.cluster[flowers]]
     return flowers[kept], places[kept]
 
 
@@ -78,16 +79,20 @@ def _one_to_one(
     points: IntArray,
     flowers: IntArray,
 ) -> tuple[IntArray, IntArray]:
-    off = seen[:, None] - places
     largest = np.trace(point_covs, axis1=1, axis2=2).max() + np.trace(covs, axis1=1, axis2=2)
-    i, j = np.nonzero(((off**2).sum(-1) < GATE_CHI2 * largest) & free)
+    i, j = np.nonzero((_apart_sq(seen, places) < GATE_CHI2 * largest) & free)
     if len(i) == 0:
         return i, j
     S = point_covs[i] + covs[j]
-    d2 = mahalanobis_sq(off[i, j], S)
+    d2 = mahalanobis_sq(seen[i] - places[j], S)
     log_det = np.linalg.slogdet(S)[1]
     near, column = np.unique(j, return_inverse=True)
     cost = np.full((len(points), len(near)), np.inf)
     cost[i, column] = np.where(d2 < GATE_CHI2, 0.5 * (d2 + log_det + 3.0 * LOG_2PI), np.inf)
     rows, columns = assign(cost, -float(np.log(null_density)))
     return points[rows], flowers[near[columns]]
+
+
+def _apart_sq(a: Array, b: Array) -> Array:
+    """Squared distances (n, k) of points a (n, 3) and b (k, 3), by one product: next to zero they are rough."""
+    return np.asarray((a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * (a @ b.T))

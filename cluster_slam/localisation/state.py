@@ -133,11 +133,11 @@ class State:
         P = self.P[columns[:, :, None], columns[:, None, :]]
         prior = Rw.T @ marks.shared_covs[marks.cluster[flowers]] @ Rw + sway_m**2 * np.eye(3)
         outside = np.where(met[:, None, None], 0.0, prior)
-        common = A @ P @ np.swapaxes(A, 1, 2) + outside
+        AP = A @ P
+        common = AP @ np.swapaxes(A, 1, 2) + outside
         own = Rw.T @ np.where(own_met[:, None, None], P[:, 18:, 18:], marks.covs[flowers]) @ Rw
-        A[own_met, :, 18:] = -Rw.T
-        total = A @ P @ np.swapaxes(A, 1, 2) + outside + np.where(own_met[:, None, None], 0.0, own)
-        return total, common, own
+        both = np.where(own_met[:, None, None], -AP[:, :, 18:] @ Rw, 0.0)
+        return common + own + both + np.swapaxes(both, 1, 2), common, own
 
     def most_off(self, sway_m: float) -> float:
         """A bound on the variance (trace, m^2) of how far a flower may be from where it is expected, camera aside."""
@@ -145,7 +145,7 @@ class State:
         at = self.cluster_at[self.cluster_at != _NONE, None] + np.arange(6)
         met = 2.0 * float(self.P[at, at].sum(1).max()) if len(at) else 0.0
         G = _by_world(transform(inverse(self.W), marks.centres[self.cluster_at == _NONE]))
-        by_world = float(np.einsum("nia,ab,nib->n", G, self.P[_W, _W], G).max()) if len(G) else 0.0
+        by_world = float(((G @ self.P[_W, _W]) * G).sum((1, 2)).max()) if len(G) else 0.0
         unmet = by_world + float(np.trace(marks.shared_covs, axis1=1, axis2=2).max()) + 3.0 * sway_m**2
         return max(met, unmet) + float(np.trace(marks.covs, axis1=1, axis2=2).max())
 
