@@ -12,6 +12,15 @@ Float32 = NDArray[np.float32]
 _PALE = 0.3  # share of crops with pale things that are no flowers
 
 
+def plain(
+    example: Example, size: int, zoom: tuple[float, float], rng: np.random.Generator
+) -> tuple[Float32, NDArray[np.float32]]:
+    """A crop (3, size, size), red green blue, 0..1, and its boxes, in its own light."""
+    image, behind, boxes = _placed(example, size, zoom, rng)
+    image, _, boxes = _turned(image, behind, boxes, rng)
+    return np.ascontiguousarray(image[:, :, ::-1].transpose(2, 0, 1), np.float32) / np.float32(255.0), boxes
+
+
 def altered(
     example: Example, size: int, zoom: tuple[float, float], rng: np.random.Generator, *, other: float
 ) -> tuple[Float32, NDArray[np.float32]]:

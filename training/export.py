@@ -8,10 +8,11 @@ import numpy as np
 import torch
 from network import STRIDE, Exported, FlowerNet
 
+STRIDE_MOST = 16  # of any layer: pictures have multiples of it
 METADATA = {
     "description": "flowers of brambles, trained on renderings",
     "task": "detect",
-    "stride": "16",
+    "stride": str(STRIDE_MOST),
     "names": "{0: 'flower'}",
     "license": "MIT",
     "score": "0.6",
@@ -25,7 +26,7 @@ def write_onnx(net: FlowerNet, path: Path, more: dict[str, str] | None = None) -
 
     path.parent.mkdir(parents=True, exist_ok=True)
     example = torch.rand(1, 3, 480, 640)
-    dynamic = {"images": {2: torch.export.Dim.DYNAMIC, 3: torch.export.Dim.DYNAMIC}}
+    dynamic = {"images": {2: STRIDE_MOST * torch.export.Dim("rows"), 3: STRIDE_MOST * torch.export.Dim("columns")}}
     model = Exported(net).eval()
     with torch.no_grad():
         program = torch.onnx.export(

@@ -3,29 +3,32 @@
     python training/measure.py cluster_slam/detect/models/flowers.onnx --worlds 20
     python training/measure.py colour --coco FOLDER/annotations.coco.json
 
-With ``--calibrate`` the measured error of the boxes' middles is written into the model's metadata.
+Renderings are counted twice: every flower of which a third or more is seen and that is not tiny; and those only that
+are "reasonable", as benchmarks of small or hidden things have it. With ``--calibrate`` the measured error of the boxes'
+middles is written into the model's metadata.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import cv2
 import numpy as np
-from pictures import HIDDEN, N_FRAMES, SEEN, render_world
+from pictures import HIDDEN, SEEN, render_usual, render_world
 
 from cluster_slam.detect import open_detector
 from cluster_slam.records import ImageDetections
-from cluster_slam.simulate.config import MODERATE
-from cluster_slam.simulate.render.frames import Renderer
-from cluster_slam.simulate.session import simulate_session
 
 HELD_OUT = 90_000  # first seed of the worlds that no training sees
-_MIN_PX = 6.0  # a flower smaller than that is neither wanted nor wrong
+_MIN_PX = 6.0  # longer side: a flower smaller than that is neither wanted nor wrong
+_LEAST = 0.15  # score
+_PLANTS = {"random": render_world, "usual": render_usual}
+# Least share that is seen, shorter side in px. "Reasonable" in P. Dollar and others, "Pedestrian detection", 2012: 65 %
+# or more is seen; S. Yang and others, "WIDER FACE", 2016, leave out faces below 10 px.
+_REASONABLE = (0.65, 10.0)
 
 
 def main() -> None:
@@ -33,52 +36,52 @@ def main() -> None:
     options.add_argument("model", help="an ONNX file, own, or colour")
     options.add_argument("--worlds", type=int, default=12)
     options.add_argument("--first", type=int, default=HELD_OUT, help="seed of the first plant")
-    options.add_argument("--usual", action="store_true", help="plants and light of a usual session, not random ones")
+    options.add_argument("--plants", nargs="+", choices=sorted(_PLANTS), default=["usual"])
     options.add_argument("--coco", type=Path)
     options.add_argument("--category", default="flower")
     options.add_argument("--calibrate", action="store_true")
-    options.add_argument("--seen", type=float, default=SEEN, help="least share of a wanted flower that is seen")
-    options.add_argument("--shorter", type=float, default=0.0, help="least shorter side of a wanted flower, px")
-    options.add_argument("--at", type=float, default=0.5, help="score at which groups of flowers are counted")
+    options.add_argument("--at", type=float, default=0.6, help="score at which groups of flowers are counted")
     chosen = options.parse_args()
     is_file = chosen.model.endswith(".onnx")
-    detector = open_detector(chosen.model if is_file else None, name=None if is_file else chosen.model, score=0.02)
+    detector = open_detector(chosen.model if is_file else None, name=None if is_file else chosen.model, score=_LEAST)
     if chosen.coco is not None:
-        tables = annotated(detector, chosen.coco, chosen.category)
-    else:
-        tables = rendered(detector, range(chosen.first, chosen.first + chosen.worlds), chosen)
-    scores, hits, errors, flowers = (np.concatenate([table[i] for table in tables]) for i in range(4))
-    report(scores, hits, int(flowers[:, 0].sum()), chosen.at)
-    if chosen.coco is None:
-        by_group(flowers, chosen.at)
-    if len(errors):
-        a, b = centre_sigma(errors)
-        print(f"middle of a box: sigma of u and of v = hypot({a:.2f} px, {b:.3f} of its size)")
-        print(f"its mean error: {errors[:, 0].mean():+.2f} px in u, {errors[:, 1].mean():+.2f} px in v")
-        if chosen.calibrate:
-            state(Path(chosen.model), {"sigma_px": f"{a:.3f} {b:.4f}", "pixel_origin": "centre"})
+        scores, hits, _, flowers = _joined(annotated(detector, chosen.coco, chosen.category))
+        report(scores, hits, flowers, chosen.at)
+        return
+    looks = looked(detector, range(chosen.first, chosen.first + chosen.worlds), chosen.plants)
+    print("reasonable flowers: 65 % seen or more, shorter side 10 px or more")
+    scores, hits, _, flowers = _joined(counted(looks, *_REASONABLE))
+    report(scores, hits, flowers, chosen.at)
+    print("all flowers: 35 % seen or more, longer side 6 px or more")
+    scores, hits, errors, flowers = _joined(counted(looks, SEEN, 0.0))
+    report(scores, hits, flowers, chosen.at)
+    by_group(flowers, chosen.at)
+    a, b = centre_sigma(errors)
+    print(f"middle of a box: sigma of u and of v = hypot({a:.2f} px, {b:.3f} of its size)")
+    print(f"its mean error: {errors[:, 0].mean():+.2f} px in u, {errors[:, 1].mean():+.2f} px in v")
+    if chosen.calibrate:
+        state(Path(chosen.model), {"sigma_px": f"{a:.3f} {b:.4f}", "pixel_origin": "centre"})
 
 
-def rendered(detector: object, seeds: range, chosen: argparse.Namespace) -> list[tuple]:
-    """Matches in the pictures of held-out worlds."""
+def looked(detector: object, seeds: range, plants: list[str]) -> list[tuple]:
+    """What is found in the pictures of held-out worlds, their true boxes, their shapes."""
+    pictures = (picture for name in plants for seed in seeds for picture in _PLANTS[name](seed))
+    return [(detector.detect(p.colour), p.boxes, p.colour.shape[:2]) for p in pictures]
+
+
+def counted(looks: list[tuple], seen: float, shorter: float) -> list[tuple]:
+    """Matches, where those flowers count of which such a share is seen and whose shorter side is so long."""
     tables = []
-    for seed in seeds:
-        for picture in usual_world(seed) if chosen.usual else render_world(seed):
-            b = picture.boxes
-            is_big = b.sizes.max(1) >= _MIN_PX
-            height, width = picture.colour.shape[:2]
-            inside = (b.centres > 3).all(1) & (b.centres < [width - 4, height - 4]).all(1)
-            wanted = (b.visible >= chosen.seen) & (b.sizes.min(1) >= chosen.shorter) & is_big & inside
-            known = b.visible >= HIDDEN
-            found = detector.detect(picture.colour)
-            tables.append(matched(found, np.column_stack([b.centres, b.sizes]), wanted, known & ~wanted, b.visible))
+    for found, b, (height, width) in looks:
+        inside = (b.centres > 3).all(1) & (b.centres < [width - 4, height - 4]).all(1)
+        wanted = (b.visible >= seen) & (b.sizes.min(1) >= shorter) & (b.sizes.max(1) >= _MIN_PX) & inside
+        ignored = (b.visible >= HIDDEN) & ~wanted
+        tables.append(matched(found, np.column_stack([b.centres, b.sizes]), wanted, ignored, b.visible))
     return tables
 
 
-def usual_world(seed: int) -> list:
-    config = replace(MODERATE, level=1, fps=N_FRAMES / 30.0)
-    renderer = Renderer(simulate_session(config, seed=seed), seed=seed)
-    return [renderer.frame(k) for k in range(N_FRAMES)]
+def _joined(tables: list[tuple]) -> tuple[np.ndarray, ...]:
+    return tuple(np.concatenate([table[i] for table in tables]) for i in range(len(tables[0])))
 
 
 def annotated(detector: object, path: Path, category: str) -> list[tuple]:
@@ -152,8 +155,9 @@ def iou(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     return shared / (box[2:].prod() + boxes[:, 2:].prod(1) - shared + 1e-9)
 
 
-def report(scores: np.ndarray, hits: np.ndarray, n_wanted: int, at: float) -> None:
+def report(scores: np.ndarray, hits: np.ndarray, flowers: np.ndarray, at: float) -> None:
     """Precision and recall over the least score."""
+    n_wanted = int(flowers[:, 0].sum())
     order = np.argsort(-scores, kind="stable")
     true = np.cumsum(hits[order])
     recall, precision = true / max(n_wanted, 1), true / np.arange(1, len(true) + 1)
@@ -162,10 +166,10 @@ def report(scores: np.ndarray, hits: np.ndarray, n_wanted: int, at: float) -> No
         k = int((scores >= least).sum()) - 1
         if k >= 0:
             print(f"score {least:.2f}: precision {precision[k]:.3f}, recall {recall[k]:.3f}")
-    for wanted in (0.5, 0.7, 0.8, 0.9):
-        at = recall >= wanted
-        best = f"{precision[at].max():.3f}" if at.any() else "not reached"
-        print(f"at recall {wanted}: precision {best}")
+    for wanted in (0.8, 0.9, 0.95):
+        at = precision >= wanted
+        best = f"{recall[at].max():.3f}" if at.any() else "not reached"
+        print(f"at precision {wanted}: recall {best}")
 
 
 def centre_sigma(errors: np.ndarray) -> tuple[float, float]:

@@ -105,13 +105,23 @@ def usual_distance(seed: int) -> dict[str, Any]:
     return {"distance_min_m": near, "distance_max_m": near + 0.2, "focal_px": float(rng.uniform(400.0, 460.0))}
 
 
-def make_examples(
-    first_seed: int, n_worlds: int, size: int, per_picture: int, changes: Callable[[int], dict[str, Any]] | None = None
-) -> list[Example]:
+def render_near(seed: int) -> list[Picture]:
+    """The pictures of a random plant at a usual session's distance."""
+    return render_world(seed, usual_distance(seed))
+
+
+def render_usual(seed: int) -> list[Picture]:
+    """Pictures of a usual session: its plant, camera and light."""
+    config = replace(MODERATE, level=1, fps=N_FRAMES / 30.0)
+    renderer = Renderer(simulate_session(config, seed=seed), seed=seed)
+    return [renderer.frame(k) for k in range(N_FRAMES)]
+
+
+def make_examples(render: Callable[[int], list[Picture]], seeds: range, size: int, per_picture: int) -> list[Example]:
     """Examples of many worlds; the same seeds give the same examples."""
     found: list[Example] = []
-    for seed in range(first_seed, first_seed + n_worlds):
+    for seed in seeds:
         rng = np.random.default_rng([seed, 78])
-        for picture in render_world(seed, None if changes is None else changes(seed)):
+        for picture in render(seed):
             found += crops(picture, size, per_picture, rng)
     return found

@@ -1,8 +1,7 @@
-"""Train the small flower detector on renderings, measure it on others, and write it as ONNX.
+"""Train the small flower detector on renderings, and write it as ONNX.
 
     python training/train_detector.py -o cluster_slam/detect/models/flowers.onnx
 
-In three parts: random distances; further plants at those of a usual session as well; large flowers and other backdrops.
 Needs the extra ``train``. Everything is seeded; one thread; less than 20 minutes of CPU.
 """
 
@@ -10,17 +9,17 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from augment import altered
+from augment import altered, plain
 from export import write_onnx
 from muon import Muon, dense_weights
 from network import STRIDE, FlowerNet, decoded
-from pictures import HIDDEN, SEEN, Example, make_examples, usual_distance
+from pictures import HIDDEN, SEEN, Example, make_examples, render_near, render_usual, render_world
 from torch import Tensor
 
 SIZE = 128  # of a crop the network sees: small, so that most of it is about flowers
@@ -31,70 +30,77 @@ RISE = 60  # steps in which rates rise; then they fall along a cosine
 SMALL_PX = 16.0  # shorter side of a flower that is small
 
 
+WORLDS = ((render_world, 70, 4), (render_near, 30, 6), (render_usual, 50, 6))  # plants, crops of each picture
+N_STEPS = 7500
+RATE, MUON_RATE = 3e-3, 0.02  # of AdamW; of the layers that mix channels
+
+
 @dataclass(frozen=True, slots=True)
-class Part:
-    """A part of the training."""
+class Kind:
+    """A kind of crop that is learned from."""
 
-    n_steps: int
-    seed: int
-    zoom: tuple[float, float]  # by which crops are scaled
-    wants_small: bool  # crops are drawn more often, the more small flowers they show
-    other: float  # share of crops before another backdrop
-    rate: float  # of AdamW
-    muon_rate: float  # of the layers that mix channels
+    share: float  # of all crops
+    zoom: tuple[float, float]  # by which they are scaled
+    wants_small: bool  # they are drawn more often, the more small flowers they show
+    other: float | None  # share of them before another backdrop; None: with their own light and backdrop
 
 
-PARTS = (
-    Part(1200, 1, (0.615, 1.3), True, 0.4, 3e-3, 0.02),
-    Part(3200, 2, (0.615, 1.3), True, 0.4, 3e-3, 0.02),
-    Part(1000, 3, (0.615, 2.4), False, 0.6, 1.5e-3, 0.01),
+KINDS = (
+    Kind(0.55, (0.615, 1.3), True, None),
+    Kind(0.20, (0.615, 1.3), True, 0.4),
+    Kind(0.25, (0.615, 2.4), False, 0.6),
 )
 
 
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("-o", "--out", type=Path, required=True)
-    options.add_argument("--worlds", type=int, default=120)
-    options.add_argument("--near", type=int, default=30, help="further plants, for the second part")
-    options.add_argument("--share", type=float, default=1.0, help="of the steps of each part, for a trial")
+    options.add_argument("--share", type=float, default=1.0, help="of the plants and of the steps, for a trial")
     chosen = options.parse_args()
     torch.manual_seed(1)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    examples = make_examples(FIRST_WORLD, chosen.worlds, CUT, 4)
-    net = FlowerNet().to(memory_format=torch.channels_last)  # three times as fast on a CPU
-    parts = [replace(part, n_steps=max(1, round(part.n_steps * chosen.share))) for part in PARTS]
-    train(net, examples, parts[0])
-    examples += make_examples(FIRST_WORLD + chosen.worlds, chosen.near, CUT, 6, usual_distance)
+    examples = all_examples(chosen.share)
     print(f"{len(examples)} crops after {time.process_time():.0f} s of CPU", flush=True)
-    for part in parts[1:]:
-        train(net, examples, part)
+    net = FlowerNet().to(memory_format=torch.channels_last)  # three times as fast on a CPU
+    train(net, examples, max(1, round(N_STEPS * chosen.share)))
     write_onnx(net.eval(), chosen.out)
     print(f"written after {time.process_time():.0f} s of CPU: {chosen.out}", flush=True)
 
 
-def train(net: FlowerNet, examples: list[Example], part: Part) -> None:
-    """A part of the training; at its end the network has the mean of its last weights."""
+def all_examples(share: float = 1.0) -> list[Example]:
+    """Crops of all plants: random ones, those at usual distances, those of usual sessions."""
+    found: list[Example] = []
+    first = FIRST_WORLD
+    for render, n_worlds, per_picture in WORLDS:
+        n = max(1, round(n_worlds * share))
+        found += make_examples(render, range(first, first + n), CUT, per_picture)
+        first += n_worlds
+    return found
+
+
+def train(net: FlowerNet, examples: list[Example], n_steps: int, seed: int = 1) -> None:
+    """Steps over examples; at the end the network has the mean of its last weights."""
     net.train()
     muon = Muon(dense_weights(net))
     turned = {id(p) for p in muon.weights}
     rest = [p for p in net.parameters() if id(p) not in turned]
-    optimiser = torch.optim.AdamW(rest, lr=part.rate, weight_decay=1e-4)
-    rng = np.random.default_rng(part.seed)
-    shares = _shares(examples) if part.wants_small else np.full(len(examples), 1 / len(examples))
+    optimiser = torch.optim.AdamW(rest, lr=RATE, weight_decay=1e-4)
+    rng = np.random.default_rng(seed)
+    shares = [_shares(examples) if kind.wants_small else np.full(len(examples), 1 / len(examples)) for kind in KINDS]
     begin = time.process_time()
     average: dict[str, Tensor] = {}
-    for step in range(part.n_steps):
-        falling = min(1.0, (step + 1) / RISE) * (0.02 + 0.98 * 0.5 * (1 + np.cos(np.pi * step / part.n_steps)))
+    for step in range(n_steps):
+        falling = min(1.0, (step + 1) / RISE) * (0.02 + 0.98 * 0.5 * (1 + np.cos(np.pi * step / n_steps)))
         for group in optimiser.param_groups:
-            group["lr"] = part.rate * falling
-        images, targets = batch(examples, shares, part, rng)
+            group["lr"] = RATE * falling
+        images, targets = batch(examples, shares, rng)
         loss, parts = losses(net(images), targets)
         optimiser.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(rest, 5.0)
         optimiser.step()
-        muon.step(part.muon_rate * falling)
+        muon.step(MUON_RATE * falling)
         average = averaged(average, net, 0.995 if step > 2 * RISE else 0.9)
         if step % 50 == 0:
             print(f"{step} {time.process_time() - begin:.0f} s {[round(float(p), 3) for p in parts]}", flush=True)
@@ -121,10 +127,15 @@ def averaged(average: dict[str, Tensor], net: FlowerNet, keep: float) -> dict[st
     return average
 
 
-def batch(examples: list[Example], shares: np.ndarray, part: Part, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+def batch(examples: list[Example], shares: list[np.ndarray], rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     """Images (n, 3, s, s) and targets (n, 7, s / 4, s / 4): heat, use, weight of the box, offset, log size."""
-    drawn = rng.choice(len(examples), BATCH, p=shares)
-    pairs = [altered(examples[k], SIZE, part.zoom, rng, other=part.other) for k in drawn]
+    pairs = []
+    for k in rng.choice(len(KINDS), BATCH, p=[kind.share for kind in KINDS]):
+        kind, example = KINDS[k], examples[rng.choice(len(examples), p=shares[k])]
+        if kind.other is None:
+            pairs.append(plain(example, SIZE, kind.zoom, rng))
+        else:
+            pairs.append(altered(example, SIZE, kind.zoom, rng, other=kind.other))
     images = np.stack([image for image, _ in pairs])
     wide = torch.from_numpy(images).contiguous(memory_format=torch.channels_last)
     return wide, torch.from_numpy(np.stack([target(boxes) for _, boxes in pairs]))
