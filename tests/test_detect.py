@@ -211,3 +211,9 @@ def test_pictures_of_other_sizes_between_change_nothing() -> None:
 
 def test_our_own_model_is_small() -> None:
     assert own_model().stat().st_size < 1_000_000
+
+
+def test_only_what_a_model_states_leans() -> None:
+    """The detector in the package was measured; nothing is known of another."""
+    assert 0.0 < open_detector(None).lean < 0.2
+    assert open_detector(MODELS / "yolo.onnx").lean == 0.0
