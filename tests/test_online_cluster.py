@@ -54,7 +54,7 @@ def follow(track: ClusterTrack, true: np.ndarray, rng: np.random.Generator) -> n
 
 def followed(true: np.ndarray, seed: int) -> np.ndarray:
     track = ClusterTrack(1, 0.0, MotionConfig())
-    track.place(np.zeros(3), 4)
+    track.place(np.zeros(3), np.arange(4))
     track.awaken(0.0)
     return follow(track, true, np.random.default_rng(seed))
 
@@ -94,3 +94,16 @@ def test_a_motion_that_no_model_has_widens_the_covariance() -> None:
     found = followed(d, 5)[60:]
     assert found[:, 3].all()
     assert 2.0 < found[:, 0].mean() < 4.0
+
+
+def test_where_it_is_seen_does_not_follow_what_the_map_learns_of_its_rest() -> None:
+    track = ClusterTrack(0, 0.0, MotionConfig())
+    track.place(np.zeros(3), np.arange(4))
+    track.awaken(0.0)
+    track.jump(np.array([0.02, 0.0, 0.0]), 1e-6 * np.eye(3), 0.1, None, "found", 0.0)
+    moved = np.array([0.008, 0.0, 0.0])
+    track.place(moved, np.arange(4))
+    np.testing.assert_allclose(track.now(0.0)[0], [0.02, 0.0, 0.0])
+    np.testing.assert_allclose(track.displacement(0.0)[0], [0.012, 0.0, 0.0])
+    track.place(2.0 * moved, np.arange(5))  # another centroid, of one flower more
+    np.testing.assert_allclose(track.now(0.0)[0], [0.028, 0.0, 0.0])

@@ -12,7 +12,7 @@ import numpy as np
 
 from cluster_slam.geometry import Array
 from cluster_slam.online.shape import Shape, measured_by
-from cluster_slam.records import State
+from cluster_slam.records import IntArray, State
 from tracking.motion import MotionConfig, MotionKind, advance, amplitude, process_noise, state_at_rest, touch_noise
 from tracking.ukf import Innovation, UnscentedFilter
 
@@ -51,7 +51,7 @@ class ClusterTrack:
         self.kind, self.why = MotionKind.REST, "new"
         self.log_odds = -_SURE  # of sway against rest
         self.anchor: Array | None = None
-        self.n_flowers = 0
+        self.flowers: IntArray = np.zeros(0, dtype=np.int64)  # whose centroid that is
         self.anchor_cov: Array = 1e-6 * np.eye(3)
         self.filter: UnscentedFilter | None = None
         self.trembling: tuple[Array, Array] | None = None  # at rest: displacement and covariance when last seen
@@ -65,13 +65,18 @@ class ClusterTrack:
     def is_moving(self) -> bool:
         return self.kind is not MotionKind.REST and self.filter is not None
 
-    def place(self, anchor: Array, n_flowers: int) -> None:
-        """The map has moved the centroid at rest of so many flowers: the displacement stays what it was."""
-        if self.anchor is not None and self.filter is not None:
+    def place(self, anchor: Array, flowers: IntArray) -> None:
+        """The centroid at rest of these flowers (k,) ids is there by now.
+
+        With other flowers the centroid that is followed is another one. One that moves, and of which the map has moved
+        the place at rest, still is where it was seen: it is displaced otherwise.
+        """
+        is_seen_moving = self.is_moving and np.array_equal(flowers, self.flowers)
+        if self.anchor is not None and self.filter is not None and not is_seen_moving:
             x = self.filter.x.copy()
             x[:3] += anchor - self.anchor
             self.filter.reset(x, self.filter.P)
-        self.anchor, self.n_flowers = anchor, n_flowers
+        self.anchor, self.flowers = anchor, flowers
 
     def awaken(self, stamp: float) -> None:
         """Begin to follow it (it has been confirmed)."""
@@ -208,7 +213,7 @@ class ClusterTrack:
         """
         x, P = state_at_rest(anchor, self.config)
         x[6:8], P[6, 6], P[7, 7] = f.x[6:8], f.P[6, 6], f.P[7, 7]
-        if self.n_flowers >= _SHAPE:
+        if len(self.flowers) >= _SHAPE:
             P[8:11, 8:11] += self.anchor_cov + self.doubt**2 * _EYE
         return x, P
 

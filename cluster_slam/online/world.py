@@ -159,7 +159,7 @@ class World:
             mine = np.flatnonzero(table.slot == slot)
             sure = mine[table.confirmed[mine]]
             mine = sure if len(sure) else mine
-            self.clusters[slot].place(table.place[mine].mean(0), len(mine))
+            self.clusters[slot].place(table.place[mine].mean(0), table.ids[mine])
             self.clusters[slot].anchor_cov = table.cov[mine].mean(0) / np.sqrt(len(mine))
 
     def drop(self, gone: BoolArray) -> None:
