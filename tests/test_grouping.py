@@ -256,6 +256,17 @@ def test_flowers_that_are_often_missed_come_in_clusters_all_the_same() -> None:
     np.testing.assert_array_equal(label, np.repeat(np.arange(4), 4))
 
 
+@pytest.mark.parametrize("hit", [0.3, 0.5, 0.7])
+def test_chance_misses_part_no_clusters(hit: float) -> None:
+    """Each flower is missed for itself, frame by frame, so that few frames show two of a cluster; nothing moves."""
+    rng = np.random.default_rng(5)
+    middles = np.repeat(np.array([[0.0, 0, 1], [0.4, 0, 1], [0.0, 0.4, 1], [0.4, 0.4, 1]]), 3, axis=0)
+    places = middles + 0.015 * rng.standard_normal((12, 3))
+    seen = rng.random((12, N_FRAMES)) < hit
+    label = group_flowers(places, csr_matrix(1.0 * seen), None, 0.5, GroupingConfig(), rng=rng)
+    np.testing.assert_array_equal(label, np.repeat(np.arange(4), 3))
+
+
 def test_flowers_that_are_seen_one_by_one_come_in_no_clusters() -> None:
     rng = np.random.default_rng(2)
     places = np.repeat(np.eye(4, 3), 4, axis=0) + 0.015 * rng.standard_normal((16, 3))

@@ -22,6 +22,9 @@ from cluster_slam.records import IntArray
 
 _TOGETHER = (0.8, 0.15)  # share of a flower's frames that show its nearest, too, in sessions of clusters: mean, sigma
 _TOGETHER_OF_NONE = (0.45, 0.13)  # in sessions of things that stand alone
+_APART, _APART_OF_NONE = 0.04, 0.22  # mean share of moments, too long to miss a flower, that show one of two alone
+_MISSED = 0.05  # probability that a flower in view is missed for a whole moment
+_LONGEST = 20  # frames of a moment
 _SURE = 3.0  # log-likelihood, 20 to 1, that flowers move as one
 _LIKELIER = 1.0  # log-likelihood: six flowers that are all loose gain as much by chance in one of twelve draws
 REACH = 7.0  # spacings; flowers that far apart are of two clusters, whatever they do
@@ -64,7 +67,7 @@ def group_flowers(
     label = likeliest_cut(tree, likelihood)
     if config.method == "spacing":
         label = improve(label, likelihood)
-    return _numbered(label) if come_in_clusters(label, likelihood, _seen_together(places, presence)) else np.arange(n)
+    return _numbered(label) if come_in_clusters(label, likelihood, together_ratio(places, presence)) else np.arange(n)
 
 
 def _numbered(label: NDArray[Any]) -> IntArray:
@@ -96,7 +99,7 @@ def stretched_distances(places: Array, evidence: csr_matrix | None) -> Array:
 
 
 def come_in_clusters(label: IntArray, likelihood: Likelihood, together: float) -> bool:
-    """Whether this session's flowers come in clusters at all; ``together`` is how often neighbours are seen so.
+    """Whether this session's flowers come in clusters at all; ``together``: ratio by when they are seen.
 
     They do where they stand nearer than flowers that are all loose would, and are seen together: things that stand in
     groups, but do not belong together, hide each other or face another way. Where they are seldom seen together they
@@ -107,22 +110,49 @@ def come_in_clusters(label: IntArray, likelihood: Likelihood, together: float) -
         return True
     if likelihood.of(clustered) - likelihood(np.arange(len(label))) < _LIKELIER:
         return False
-    doubt = -_of_clusters(together)
-    return doubt <= 0.0 or clustered.motion > doubt
+    return together >= 0.0 or clustered.motion > -together
 
 
-def _seen_together(places: Array, presence: csr_matrix) -> float:
-    """Share of a flower's frames that show its nearest, too; the median over flowers."""
+def together_ratio(places: Array, presence: csr_matrix) -> float:
+    """Log-likelihood ratio that flowers come in clusters, by how much of the time neighbours are seen together.
+
+    Frames tell it where nearly all that is in view is seen. Where a detector misses many flowers, one at a time, frames
+    part neighbours that moments of several frames show together: of the two the one that speaks for clusters counts.
+
+    Parameters
+    ----------
+    places : (l, 3) m.
+    presence : (l, n) which frames saw each flower.
+    """
     nearest = np.asarray(cKDTree(places).query(places, k=2)[1])[:, 1]
-    both = np.asarray(presence.multiply(presence[nearest]).sum(axis=1)).ravel()
-    count = np.asarray(presence.sum(axis=1)).ravel()
-    # Of the frames that saw the one that is seen less: that one of two is often hidden says nothing of the other.
-    together = both / np.maximum(np.minimum(count, count[nearest]), 1)
-    return float(np.median(together))
+    seen = csr_matrix(presence, dtype=np.float64)
+    apart = 1.0 - _shared(_in_moments(seen), nearest)
+    by_moments = apart / _APART_OF_NONE - apart / _APART + np.log(_APART_OF_NONE / _APART)
+    return max(ratio_by_frames(_shared(seen, nearest)), float(by_moments))
 
 
-def _of_clusters(together: float) -> float:
-    """Log-likelihood ratio that flowers come in clusters, by how much of the time neighbours are seen together."""
+def ratio_by_frames(together: float) -> float:
+    """The same by the share of frames alone that show neighbours together."""
     (mean, sigma), (mean_of_none, sigma_of_none) = _TOGETHER, _TOGETHER_OF_NONE
     ratio = 0.5 * ((together - mean_of_none) / sigma_of_none) ** 2 - 0.5 * ((together - mean) / sigma) ** 2
     return float(ratio + np.log(sigma_of_none / sigma))
+
+
+def _shared(seen: csr_matrix, nearest: IntArray) -> float:
+    """Share of a flower's columns that its nearest has, too; the median over flowers (l,)."""
+    both = np.asarray(seen.multiply(seen[nearest]).sum(axis=1)).ravel()
+    count = np.asarray(seen.sum(axis=1)).ravel()
+    # Of the columns that saw the one that is seen less: that one of two is often hidden says nothing of the other.
+    return float(np.median(both / np.maximum(np.minimum(count, count[nearest]), 1)))
+
+
+def _in_moments(seen: csr_matrix) -> csr_matrix:
+    """The same (l, n) in moments of so many frames that a flower in view is hardly missed in all of them."""
+    used = seen[:, np.flatnonzero(np.asarray(seen.sum(axis=0)).ravel())].tocsc()
+    n = used.shape[1]
+    again = used[:, 1:].multiply(used[:, :-1]).sum() / max(used[:, :-1].sum(), 1.0)
+    missed = np.clip(1.0 - again, 1e-3, 1.0 - 1e-3)
+    length = int(np.clip(np.ceil(np.log(_MISSED) / np.log(missed)), 1, _LONGEST))
+    into = csr_matrix((np.ones(n), (np.arange(n), np.arange(n) // length)))
+    moments: csr_matrix = (used @ into).sign().tocsr()
+    return moments
