@@ -25,6 +25,7 @@ from cluster_slam.io.map.store import MapStore, refused
 from cluster_slam.io.map.times import iso, seconds
 from cluster_slam.io.map.write import undo
 from cluster_slam.pipeline.remember import add
+from cluster_slam.simulate.config import SimulateConfig
 from cluster_slam.simulate.season import SeasonPlant
 
 
@@ -548,8 +549,7 @@ def test_two_plants_cannot_be_told_apart(tmp_path: Path) -> None:
     plant = grown()
     with map_of(tmp_path, plant, "a") as store:
         twin = replace(rest_incoming(grown()).constellation, session="twin")
-        founded = add(store, replace(rest_incoming(grown()), constellation=twin), plant="b")
-        assert founded.also_fits == ("a",)
+        add(store, replace(rest_incoming(grown()), constellation=twin), plant="b")
         plant.grow_to(2.0)
         refused = add(store, rest_incoming(plant))
         assert refused.session is None
@@ -559,19 +559,28 @@ def test_two_plants_cannot_be_told_apart(tmp_path: Path) -> None:
         assert add(store, rest_incoming(plant), plant="a").session is not None
 
 
-def test_a_plant_that_shows_another_ones_flowers_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Founded under a name of its own, from flowers that the map has: a warning; another plant: none."""
-    path = str(tmp_path / "m.map")
+def test_a_plant_that_fits_as_well_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Half of a plant is in the map as another one, too: taken for the whole plant, with a warning."""
+    path, plant = str(tmp_path / "m.map"), SeasonPlant(replace(SMALL, session=SimulateConfig(n_clusters=12)), seed=0)
+    whole = result_of(tmp_path / "whole", plant)
+    half = SeasonPlant(plant.config, seed=0)
+    keep = half.cluster < 3
+    half.ids, half.cluster, half.offsets = half.ids[keep], half.cluster[keep], half.offsets[keep]
+    part = result_of(tmp_path / "part", half)
+    run_json = json.loads((part / "run.json").read_text())
+    (part / "run.json").write_text(json.dumps(run_json | {"session": "part"}))
+    plant.grow_to(1.0)
+    today = result_of(tmp_path / "today", plant)
     assert run(["map", "create", path, "--quiet"]) == 0
-    for name, seed, day in (("a", 0, 0.0), ("b", 0, 1.0), ("c", 1, 0.0)):
-        result = str(result_of(tmp_path / name, grown(seed, day)))
-        assert run(["map", "add", path, result, "--plant", name]) == 0
-        said = capsys.readouterr().err
-        assert ("fits a as well: it and b may be one plant, or overlap" in said) == (name == "b")
-    plant = str(result_of(tmp_path / "d", grown(1, 2.0)))
-    assert run(["map", "add", path, plant, "--json"]) == 0
+    assert run(["map", "add", path, str(whole), "--plant", "whole", "--quiet"]) == 0
+    assert run(["map", "add", path, str(part), "--plant", "part", "--quiet"]) == 0
+    capsys.readouterr()
+    assert run(["map", "add", path, str(today)]) == 0
+    assert "fits part as well: it and whole may be one plant, or overlap" in capsys.readouterr().err
+    assert run(["map", "undo", path, "--quiet"]) == 0
+    assert run(["map", "add", path, str(today), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert (told["plant"], told["also_fits"]) == ("c", [])
+    assert (told["plant"], told["also_fits"]) == ("whole", ["part"])
 
 
 def test_reading_a_result_needs_a_result(tmp_path: Path) -> None:

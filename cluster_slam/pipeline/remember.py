@@ -83,13 +83,11 @@ def add(
         tried = [name] if name in known else ([] if name is not None else known)
         plants = [store.plant(n) for n in tried]
         decision = decide(session, plants, config, similarity=similarity, progress=progress)
-        match, fits = decision.accepted, decision.fits
+        match = decision.accepted
         if match is not None and match.found is not None:
             _check_order(store, session, match.name)
             entry = _known(store, incoming, match.found, decision, config)
         elif not plants or (new_plant and name is None and decision.refusal is not Refusal.AMBIGUOUS):
-            others = store.plants() if known and not plants else []
-            fits = decide(session, others, config, similarity=similarity, progress=progress).fits
             entry = _first(store, incoming, name or _free_name(session, known), config)
         else:
             return Added(None, decision)
@@ -97,7 +95,7 @@ def add(
     stored = store.sessions(entry.plant.name)[-1]
     new, fresh = int(entry.cluster_is_new.sum()), int(entry.flower_is_new.sum())
     counts = (len(entry.cluster_is_new) - new, new, len(entry.missed), len(entry.flower_is_new) - fresh, fresh)
-    return Added(stored, decision, *counts, tuple(n for n in fits if n != entry.plant.name))
+    return Added(stored, decision, *counts, tuple(n for n in decision.fits if n != entry.plant.name))
 
 
 def _check_new(store: MapStore, incoming: Incoming) -> None:
