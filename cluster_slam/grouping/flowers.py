@@ -126,9 +126,7 @@ def together_ratio(places: Array, presence: csr_matrix) -> float:
     """
     nearest = np.asarray(cKDTree(places).query(places, k=2)[1])[:, 1]
     seen = csr_matrix(presence, dtype=np.float64)
-    apart = 1.0 - _shared(_in_moments(seen), nearest)
-    by_moments = apart / _APART_OF_NONE - apart / _APART + np.log(_APART_OF_NONE / _APART)
-    return max(ratio_by_frames(_shared(seen, nearest)), float(by_moments))
+    return max(ratio_by_frames(_shared(seen, nearest)), ratio_by_moments(_shared(_in_moments(seen), nearest)))
 
 
 def ratio_by_frames(together: float) -> float:
@@ -136,6 +134,18 @@ def ratio_by_frames(together: float) -> float:
     (mean, sigma), (mean_of_none, sigma_of_none) = _TOGETHER, _TOGETHER_OF_NONE
     ratio = 0.5 * ((together - mean_of_none) / sigma_of_none) ** 2 - 0.5 * ((together - mean) / sigma) ** 2
     return float(ratio + np.log(sigma_of_none / sigma))
+
+
+def ratio_by_moments(together: float) -> float:
+    """The same by the share of moments that show neighbours together."""
+    apart = 1.0 - together
+    return float(apart / _APART_OF_NONE - apart / _APART + np.log(_APART_OF_NONE / _APART))
+
+
+def moment_length(again: float) -> int:
+    """Frames of a moment, where of the flowers in one frame a share ``again`` is seen in the next."""
+    missed = np.clip(1.0 - again, 1e-3, 1.0 - 1e-3)
+    return int(np.clip(np.ceil(np.log(_MISSED) / np.log(missed)), 1, _LONGEST))
 
 
 def _shared(seen: csr_matrix, nearest: IntArray) -> float:
@@ -151,8 +161,7 @@ def _in_moments(seen: csr_matrix) -> csr_matrix:
     used = seen[:, np.flatnonzero(np.asarray(seen.sum(axis=0)).ravel())].tocsc()
     n = used.shape[1]
     again = used[:, 1:].multiply(used[:, :-1]).sum() / max(used[:, :-1].sum(), 1.0)
-    missed = np.clip(1.0 - again, 1e-3, 1.0 - 1e-3)
-    length = int(np.clip(np.ceil(np.log(_MISSED) / np.log(missed)), 1, _LONGEST))
+    length = moment_length(again)
     into = csr_matrix((np.ones(n), (np.arange(n), np.arange(n) // length)))
     moments: csr_matrix = (used @ into).sign().tocsr()
     return moments

@@ -10,8 +10,9 @@ from scipy.spatial import cKDTree
 from cluster_slam.config import GroupingConfig
 from cluster_slam.geometry import Array
 from cluster_slam.grouping import group_flowers
-from cluster_slam.grouping.flowers import REACH, spacing_of
+from cluster_slam.grouping.flowers import REACH, ratio_by_frames, ratio_by_moments, spacing_of
 from cluster_slam.online.comotion import CommonMotion
+from cluster_slam.online.moments import Moments
 from cluster_slam.online.regrouping import Round, group_together
 from cluster_slam.records import BoolArray, IntArray
 
@@ -29,6 +30,7 @@ class OnlineGrouping:
         self.config = config
         self.motion = CommonMotion(_ROOM)
         self.counts = np.zeros((_ROOM, _ROOM))  # frames that saw both (the diagonal: that saw it)
+        self.moments = Moments(_ROOM)
         self.free = list(range(_ROOM))[::-1]
         self.link = 0.0  # m, flowers nearer than this to a cluster join it
         self.reach = np.inf  # m, flowers so far apart are of two clusters
@@ -43,6 +45,7 @@ class OnlineGrouping:
             counts = np.zeros((2 * old, 2 * old))
             counts[:old, :old] = self.counts
             self.counts = counts
+            self.moments.grow(2 * old)
             self.motion.grow(2 * old)
             self.free = list(range(old, 2 * old))[::-1]
         return self.free.pop()
@@ -51,6 +54,7 @@ class OnlineGrouping:
         """These flowers are no more."""
         if len(seats):
             self.counts[seats], self.counts[:, seats] = 0.0, 0.0
+            self.moments.clear(seats)
             self.motion.clear(seats)
             self.free += seats.tolist()
 
@@ -58,6 +62,7 @@ class OnlineGrouping:
         """Flowers (q,), at rest at ``places`` (q, 3), were seen in one frame at w (q, 3), variances (q,) of an axis."""
         self.motion.observe(stamp, seats, w, var, places, self.reach)
         self.counts[seats[:, None], seats] += 1.0
+        self.moments.observe(seats)
 
     def together(self, a: int, b: int) -> tuple[float, float]:
         """Frames that saw both, and frames that saw the rarer one."""
@@ -94,7 +99,7 @@ class OnlineGrouping:
             return None
         self.round = None
         alive = np.array([i in seat_of for i in going.ids.tolist()], dtype=bool)
-        label = going.label(self._seen_together(going, alive, seat_of))
+        label = going.label(self._together_ratio(going, alive, seat_of))
         self.link = going.link(label)
         return going.ids[alive], label[alive]
 
@@ -109,15 +114,19 @@ class OnlineGrouping:
         label, self.link = group_together(places, volume)
         return label
 
-    def _seen_together(self, going: Round, alive: BoolArray, seat_of: dict[int, int]) -> float:
-        """Median share of the frames with the rarer of two neighbours that show both."""
+    def _together_ratio(self, going: Round, alive: BoolArray, seat_of: dict[int, int]) -> float:
+        """Log-likelihood ratio that flowers come in clusters, by how often neighbours are seen together."""
         places = going.likelihood.places[alive]
         if len(places) < 2:
-            return 1.0
+            return 0.0
         seats = np.array([seat_of[i] for i in going.ids[alive].tolist()])
         nearest = np.asarray(cKDTree(places).query(places, k=2)[1])[:, 1]
-        each = self.counts[seats, seats]
-        fewer = np.minimum(each, each[nearest])
-        enough = fewer >= min(_ENOUGH_LOOKS, float(fewer.max()))
-        both = self.counts[seats, seats[nearest]]
-        return float(np.median(both[enough] / np.maximum(fewer[enough], 1.0)))
+        by_frames = ratio_by_frames(_shared(self.counts, seats, seats[nearest]))
+        return max(by_frames, ratio_by_moments(_shared(self.moments.counts, seats, seats[nearest])))
+
+
+def _shared(counts: Array, seats: IntArray, nearest: IntArray) -> float:
+    """Median share of the frames (or moments) with the rarer of two neighbours that show both."""
+    fewer = np.minimum(counts[seats, seats], counts[nearest, nearest])
+    enough = fewer >= min(_ENOUGH_LOOKS, float(fewer.max()))
+    return float(np.median(counts[seats, nearest][enough] / np.maximum(fewer[enough], 1.0)))

@@ -14,7 +14,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial.distance import squareform
 
 from cluster_slam.geometry import Array
-from cluster_slam.grouping.flowers import come_in_clusters, ratio_by_frames, stretched_distances
+from cluster_slam.grouping.flowers import come_in_clusters, stretched_distances
 from cluster_slam.grouping.likelihood import Likelihood
 from cluster_slam.grouping.partition import Cuts, Partition, improve, likeliest_cut, neighbours_of
 from cluster_slam.records import BoolArray, IntArray
@@ -78,11 +78,9 @@ class Round:
             self._clusters = np.unique(cuts.label).tolist()[::-1]
 
     def label(self, together: float) -> IntArray:
-        """Cluster (l,) of each flower; ``together``: how often neighbours are seen in one frame."""
+        """Cluster (l,) of each flower; ``together``: ratio by when neighbours are seen."""
         label = self.partition.label
-        if np.bincount(label).max() < _FEWEST or not come_in_clusters(
-            label, self.likelihood, ratio_by_frames(together)
-        ):
+        if np.bincount(label).max() < _FEWEST or not come_in_clusters(label, self.likelihood, together):
             return np.arange(len(label))
         return label
 
