@@ -168,7 +168,7 @@ def test_who_stands_elsewhere_is_not_sure_for_long_and_finds_back() -> None:
         if i == 60:
             assert follower.beliefs is not None
             follower.beliefs.mean[:, :3] += [3.0, -2.0, 2.0]
-        place = follower.step(i, o.points[rows], o.covs[rows], np.full(len(rows), 0.3))
+        place = follower.step(i, o.points[rows], o.covs[rows], np.full(len(rows), 0.3 if i % 5 else 1.0))
         if place.reason == "":
             off[i] = np.linalg.norm(place.T_map_camera[:3, 3] - true[i, :3, 3])
     assert np.nanmax(off[:60]) < 0.5
@@ -192,3 +192,13 @@ def test_the_likelihood_of_a_point_is_that_of_all_beliefs_together() -> None:
     expected = np.log((w / w.sum()) @ (total + 0.03 / 50.0))
     _, got = beliefs.see(q, S, 1.0, PLACES, 50.0, np.random.default_rng(11))
     assert got == pytest.approx(expected)
+
+
+def test_a_map_of_another_floor_is_not_believed() -> None:
+    session, _, marks = drive(160, np.random.default_rng(12))
+    shuffled = np.random.default_rng(13).uniform(-2.0, 7.0, (8, 2))
+    places = np.zeros((8, 3))
+    places[:, [0, 1]] = shuffled
+    wrong = localise(session, [landmarks(places, np.arange(8))])
+    assert wrong.is_located.mean() < 0.05
+    assert localise(session, [marks]).is_located.mean() > 0.7

@@ -27,6 +27,7 @@ _N_MODES = 4  # cells that are looked at for the likeliest place
 _ROUGH = 0.1  # one sigma of a place over the extent of the landmarks: who knows it no better is not there
 _SURE = 0.99  # of the beliefs in one place
 _LOST_POINTS, _LOST_SHARE = 15, 0.25  # of the last points no landmark's: all is begun anew, beside
+_NEWS, _TRUST = 0.5, float(np.log(1e4))  # points that count for so much tell whether the map is of this place; at most
 _LOYAL = float(np.log(100.0))  # log odds that what was believed is right all the same
 _PATIENCE = 5  # frames that may pass until a point follows another
 
@@ -58,6 +59,7 @@ class FlatFollower:
         self._waited = 0
         self.rival: Beliefs | None = None  # begun later
         self.lead = np.inf  # log odds against it
+        self.trust = 0.0  # log odds that what is seen is in the map
 
     def step(self, frame: int, points: Array, covs: Array, news: Array) -> FlatPlace:
         """The next frame, with points (n, 3), covariances (n, 3, 3), and what each counts for (n,)."""
@@ -107,7 +109,7 @@ class FlatFollower:
         if self.rival is None:
             return
         if self.lead < 0.0:
-            self.beliefs, self.rival, self._misses = self.rival, None, []
+            self.beliefs, self.rival, self._misses, self.trust = self.rival, None, [], 0.0
         elif self.lead > 2.0 * _LOYAL:
             self.rival, self._misses = None, []
         else:
@@ -127,6 +129,8 @@ class FlatFollower:
         gain = anywhere
         if self.rival is not None or not is_first:
             none, gain = beliefs.see(q, S, news, self.places, self.area, self.rng)
+            if news >= _NEWS:  # unknown landmarks would be seen anywhere
+                self.trust = min(self.trust + gain - anywhere, _TRUST)
             self._misses = [*self._misses[-(_LOST_POINTS - 1) :], float(beliefs.weights @ none)]
         if self.rival is not None:
             other = anywhere if is_first else self.rival.see(q, S, news, self.places, self.area, self.rng)[1]
@@ -155,7 +159,7 @@ class FlatFollower:
         none = np.full(len(q), CLUTTER)
         w = beliefs.weights
         here = self._mode(beliefs, w)
-        share = float(w[here].sum())
+        share = float(w[here].sum()) / (1.0 + float(np.exp(-self.trust)))
         if self.rival is not None:
             share /= 1.0 + float(np.exp(-self.lead))
         w = np.where(here, w, 0.0)
