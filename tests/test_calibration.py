@@ -16,7 +16,7 @@ from cluster_slam.graph.calibration import StillPoints, larger, motion_pairs, no
 from cluster_slam.pipeline.calibrate import calibrate
 from cluster_slam.pipeline.calibrate_board import parse_board
 from cluster_slam.sensors.interpolation import interpolate
-from cluster_slam.simulate import simulate_session
+from cluster_slam.simulate import Simulated, simulate_session
 from cluster_slam.simulate.config import MODERATE
 
 X_TRUE = se3_exp(np.array([0.1, -0.2, 1.5, 0.03, -0.05, 0.04]))
@@ -139,6 +139,17 @@ def test_an_arm_that_turns_about_one_axis_is_told_which_are_missing() -> None:
     assert xi @ np.linalg.solve(found.mounting.cov, xi) < 30.0
 
 
+def _scatter_m(made: Simulated, X: Array) -> float:
+    """Median distance of true observations from their flowers' medians, under that mounting."""
+    ids, o = made.truth.flower_ids, made.session.observations
+    assert ids is not None
+    where = transform((made.session.poses @ X)[o.frame], o.points)
+    away = [
+        np.linalg.norm(where[ids == i] - np.median(where[ids == i], axis=0), axis=1) for i in np.unique(ids[ids >= 0])
+    ]
+    return float(np.median(np.concatenate(away)))
+
+
 def test_flowers_calibrate_their_camera(tmp_path: Path) -> None:
     made = simulate_session(replace(MODERATE, duration_s=8.0, fps=10.0), seed=3)
     found = calibrate(made.session)
@@ -147,6 +158,7 @@ def test_flowers_calibrate_their_camera(tmp_path: Path) -> None:
     assert np.linalg.norm(xi[:3]) < 0.003
     assert xi @ np.linalg.solve(found.mounting.cov, xi) / 6.0 < 3.0
     assert found.status == "ok"
+    assert found.mounting.scatter_m == pytest.approx(_scatter_m(made, found.mounting.X), rel=0.05)
 
 
 def test_poses_of_the_camera_cannot_be_calibrated() -> None:

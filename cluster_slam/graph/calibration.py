@@ -119,7 +119,7 @@ def refine_mounting(
         if np.linalg.norm(step) < 1e-8:
             break
     J, r, weight = _linearised(seen, X, offset, scale, time_sigma_s is not None, scale_sigma is not None)
-    return Mounting(X, offset, scale, _covariance(J, r, weight, seen, prior), _scatter(seen, X, offset, scale))
+    return Mounting(X, offset, scale, _covariance(J, r, weight, seen, prior), scatter_of(seen, X, offset, scale))
 
 
 def _extras(offset: float, scale: float, time_sigma_s: float | None, scale_sigma: float | None) -> Array:
@@ -215,7 +215,8 @@ def no_worse(cov: Array, prior: Array) -> Array:
     return out
 
 
-def _scatter(seen: StillPoints, X: Array, offset: float, scale: float) -> float:
+def scatter_of(seen: StillPoints, X: Array, offset: float = 0.0, scale: float = 1.0) -> float:
+    """Median distance (m) of the observations from their points' medians in the world, under a mounting X (4, 4)."""
     w = transform(seen.flange_at(offset), transform(X, scale * seen.points))
     away = np.empty(len(w))
     for j in np.unique(seen.label):

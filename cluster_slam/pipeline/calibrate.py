@@ -17,6 +17,7 @@ from cluster_slam.graph.calibration import (
     motion_pairs,
     park_martin,
     refine_mounting,
+    scatter_of,
 )
 from cluster_slam.graph.noise import pose_model
 from cluster_slam.pipeline.calibrate_report import STILL_RAD, CalibrationReport, excitation_of, report_on
@@ -70,9 +71,8 @@ def calibrate(
         )
         result = again
     if result.calibration is not None and not (time_offset or depth_scale):
-        mounting = replace(
-            mounting, X=result.calibration.T_flange_camera, cov=larger(mounting.cov, result.calibration.cov)
-        )
+        X, cov = result.calibration.T_flange_camera, larger(mounting.cov, result.calibration.cov)
+        mounting = replace(mounting, X=X, cov=cov, scatter_m=scatter_of(seen, X))
     unobserved = () if result.calibration is None else result.calibration.unobserved
     return report_on(session, mounting, len(seen.points), unobserved, "flowers", time_offset, depth_scale)
 

@@ -11,6 +11,7 @@ import pytest
 from localisation_studies import BOUND, CLUSTERS, LOCATED, NEAR, NEES, RIGHT, frames, windows
 from localisation_trials import Trial, map_of, plant_of
 from localisation_windows import Window, window
+from particle_reference import particle_filter
 from tables import Tables
 from vehicle_reference import told_filter
 
@@ -164,7 +165,8 @@ def test_vehicles_among_tubes(name: str, add_row: Tables) -> None:
     assert truth.T_world_camera is not None
     assert truth.rest_positions is not None
     assert truth.rest_cluster_ids is not None
-    found = localise(session, [landmarks(truth.rest_positions, truth.rest_cluster_ids, plant="mrclam6")])
+    marks = landmarks(truth.rest_positions, truth.rest_cluster_ids, plant="mrclam6")
+    found = localise(session, [marks])
 
     def share(T: Array) -> float:
         xi = se3_log(inverse(T) @ truth.T_world_camera)
@@ -180,6 +182,7 @@ def test_vehicles_among_tubes(name: str, add_row: Tables) -> None:
         "vehicles",
         session=name,
         odometry=share(session.T_world_camera),
+        particles=share(particle_filter(session, marks)),
         told=told,
         ours=ours,
         ours_over_told=ours / told,
