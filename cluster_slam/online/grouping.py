@@ -116,7 +116,7 @@ class OnlineGrouping:
 
     def _together_ratio(self, going: Round, alive: BoolArray, seat_of: dict[int, int]) -> float:
         """Log-likelihood ratio that flowers come in clusters, by how often neighbours are seen together."""
-        places = going.likelihood.places[alive]
+        places = going.places[alive]
         if len(places) < 2:
             return 0.0
         seats = np.array([seat_of[i] for i in going.ids[alive].tolist()])

@@ -38,19 +38,28 @@ class Round:
         asked: BoolArray,
         anew: bool = True,
     ) -> None:
-        self.ids = ids
+        self.ids, self.places = ids, places
         self.likelihood = Likelihood(places, volume, evidence)
-        distance = stretched_distances(places, evidence)
-        self.tree = linkage(squareform(0.5 * (distance + distance.T), checks=False), "average")
-        label = np.unique(label, return_inverse=True)[1].astype(np.int64)
-        self.partition = Partition(label, self.likelihood, distance)
-        self.neighbours = neighbours_of(places)
-        self._cuts = Cuts(self.tree, self.likelihood) if anew else None
-        self._flowers = np.flatnonzero(asked).tolist()[::-1]
-        self._clusters = np.unique(label[asked]).tolist()[::-1]
+        self._distance = stretched_distances(places, evidence)
+        self._label = np.unique(label, return_inverse=True)[1].astype(np.int64)
+        self._asked, self._anew, self._is_prepared = asked, anew, False
+
+    def _prepare(self) -> None:
+        """What takes as long as many changes, and has a frame of its own."""
+        distance = 0.5 * (self._distance + self._distance.T)
+        self.tree = linkage(squareform(distance, checks=False), "average")
+        self.partition = Partition(self._label, self.likelihood, self._distance)
+        self.neighbours = neighbours_of(self.places)
+        self._cuts = Cuts(self.tree, self.likelihood) if self._anew else None
+        self._flowers = np.flatnonzero(self._asked).tolist()[::-1]
+        self._clusters = np.unique(self._label[self._asked]).tolist()[::-1]
+        self._is_prepared = True
 
     def work(self, n_changes: int) -> bool:
         """Try so many changes or a few more; whether all have been asked."""
+        if not self._is_prepared:
+            self._prepare()
+            return False
         if self._cuts is not None:
             if self._cuts.work(n_changes):
                 self._take(self._cuts)
@@ -105,6 +114,8 @@ def group_together(places: Array, volume: float) -> tuple[IntArray, float]:
     tree = linkage(squareform(stretched_distances(places, nothing), checks=False), "average")
     likelihood = Likelihood(places, volume, None)
     begun = improve(likeliest_cut(tree, likelihood), likelihood)
-    round_of = Round(np.arange(n), places, begun, volume, nothing, np.zeros(n, dtype=bool))
+    round_of = Round(np.arange(n), places, begun, volume, nothing, np.zeros(n, dtype=bool), anew=False)
+    while not round_of.work(1):
+        pass
     label = np.unique(round_of.label(1.0), return_inverse=True)[1].astype(np.int64)
     return label, round_of.link(label)
