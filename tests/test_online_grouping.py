@@ -13,6 +13,7 @@ from cluster_slam.grouping import Motion
 from cluster_slam.grouping.comotion import motion_evidence
 from cluster_slam.online.comotion import CommonMotion
 from cluster_slam.online.regrouping import Round
+from cluster_slam.online.upkeep import regrouped
 from cluster_slam.online.world import World
 
 SIGMA = 0.002
@@ -111,3 +112,18 @@ def test_how_much_a_look_holds_is_not_taken_from_a_few_points() -> None:
         found.append(world.view_volume())
     # Width times height times mean depth; independent sides have independent ranges.
     assert np.mean(found) == pytest.approx(0.25, rel=0.1)
+
+
+def test_of_two_flowers_that_part_the_older_one_keeps_the_name() -> None:
+    world = World(OnlineConfig(), None, 0)
+    slot = world.new_cluster(0.0)
+    name = world.clusters[slot].id
+    for place in (0.0, 0.1):
+        added = world.flowers.add(
+            np.array([[place, 0.0, 0.5]]), 1e-6 * np.eye(3)[None], np.zeros((1, 3, 6)), np.array([slot]), 0.0
+        )
+        world.flowers.confirmed[added] = True
+    world.flowers.n[:] = 4, 400
+    regrouped(world, np.arange(2), np.array([0, 1]), 1.0)
+    assert world.names()[world.flowers.slot[1]] == name
+    assert world.names()[world.flowers.slot[0]] != name

@@ -105,11 +105,12 @@ def regrouped(world: World, rows: IntArray, label: IntArray, stamp: float) -> No
     table = world.flowers
     old = table.slot[rows]
     label = np.unique(label, return_inverse=True)[1].astype(np.int64)
-    weight = np.zeros((int(label.max()) + 1, len(world.clusters)))
+    weight, n_seen = np.zeros((2, int(label.max()) + 1, len(world.clusters)))
     np.add.at(weight, (label, old), 1.0)
+    np.add.at(n_seen, (label, old), table.n[rows])
     if ((weight > 0).sum(0) <= 1).all() and ((weight > 0).sum(1) <= 1).all():
         return
-    slot_of = keep_names(world, weight, stamp)
+    slot_of = keep_names(world, weight, n_seen, stamp)
     before = table.slot.copy()
     table.slot[rows] = slot_of[label]
     left_out = np.ones(len(table), dtype=bool)
@@ -131,12 +132,17 @@ def regrouped(world: World, rows: IntArray, label: IntArray, stamp: float) -> No
     world.drop_empty(np.zeros(0, dtype=np.int64))
 
 
-def keep_names(world: World, weight: Array, stamp: float) -> IntArray:
-    """Slots (g,) of groups that share ``weight`` (g, c) flowers with the clusters: largest shares first, then age."""
+def keep_names(world: World, weight: Array, n_seen: Array, stamp: float) -> IntArray:
+    """Slots (g,) of groups that share ``weight`` (g, c) flowers with the clusters: largest shares first.
+
+    Of equal ones that which was seen more often (g, c): of two flowers that part, the older one keeps the name.
+    """
     slot_of = np.full(len(weight), -1, dtype=np.int64)
     taken = np.zeros(len(world.clusters), dtype=bool)
-    shares = [(-weight[g, s], world.clusters[s].first, g, s) for g, s in np.argwhere(weight > 0).tolist()]
-    for _, _, g, s in sorted(shares):
+    shares = [
+        (-weight[g, s], -n_seen[g, s], world.clusters[s].first, g, s) for g, s in np.argwhere(weight > 0).tolist()
+    ]
+    for *_, g, s in sorted(shares):
         if slot_of[g] < 0 and not taken[s]:
             slot_of[g], taken[s] = s, True
     for g in np.flatnonzero(slot_of < 0).tolist():
