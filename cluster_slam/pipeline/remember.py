@@ -81,7 +81,7 @@ def add(
         name = plant or (None if any_plant else session.plant)
         known = store.plant_names()
         tried = [name] if name in known else ([] if name is not None else known)
-        plants = [store.plant(n) for n in tried]
+        plants = [store.plant(n, with_sightings=False) for n in tried]
         decision = decide(session, plants, config, similarity=similarity, progress=progress)
         match = decision.accepted
         if match is not None and match.found is not None:
@@ -140,7 +140,7 @@ def _first(store: MapStore, incoming: Incoming, name: str, config: MapConfig) ->
 
 def _known(store: MapStore, incoming: Incoming, found: Found, decision: Decision, config: MapConfig) -> Entry:
     """The session shows a plant that the map has."""
-    plant = store.plant(found.plant.name)
+    plant = store.plant(found.plant.name, with_sightings=False)
     who = identify(incoming.constellation, found, decision.probability)
     rows = np.searchsorted(plant.flower_ids, found.plant.flower_ids)
     is_known = who.flower >= 0
@@ -210,6 +210,5 @@ def match_all(
     progress: Progress | None = None,
 ) -> Decision:
     """How well a session fits each plant of the map, best first; nothing is changed."""
-    return decide(
-        incoming.constellation, store.plants(), config or MapConfig(), similarity=similarity, progress=progress
-    )
+    plants = store.plants(with_sightings=False)
+    return decide(incoming.constellation, plants, config or MapConfig(), similarity=similarity, progress=progress)

@@ -18,7 +18,7 @@ Row = tuple[Any, ...]
 
 
 def plant_from_rows(
-    plant: Row, clusters: Sequence[Row], flowers: Sequence[Row], last: float | None, sightings: Sightings
+    plant: Row, clusters: Sequence[Row], flowers: Sequence[Row], last: float | None, sightings: Sightings | None
 ) -> PlantMap:
     """A plant of its row in ``plants`` and its rows in ``clusters`` and ``flowers``, in the order of the schema."""
     c = _numbers(clusters, N_CLUSTER_COLUMNS)

@@ -87,8 +87,8 @@ class MapStore:
         """Names of all plants, in the order in which they came."""
         return [name for (name,) in self.read("SELECT name FROM plants ORDER BY id")]
 
-    def plant(self, name: str) -> PlantMap:
-        """One plant by its name.
+    def plant(self, name: str, *, with_sightings: bool = True) -> PlantMap:
+        """One plant by its name; sightings are of use to predictions alone.
 
         Raises
         ------
@@ -108,7 +108,8 @@ class MapStore:
             (plant_id,),
         )
         last = self.read("SELECT max(end) FROM sessions WHERE plant_id = ?", (plant_id,))[0][0]
-        return plant_from_rows(found[0], clusters, flowers, last, self._sightings(plant_id))
+        sightings = self._sightings(plant_id) if with_sightings else None
+        return plant_from_rows(found[0], clusters, flowers, last, sightings)
 
     def _sightings(self, plant_id: int) -> Sightings:
         """Which session saw which flowers of a plant."""
@@ -122,9 +123,9 @@ class MapStore:
         )
         return sightings_from_rows(sessions, seen)
 
-    def plants(self) -> list[PlantMap]:
+    def plants(self, *, with_sightings: bool = True) -> list[PlantMap]:
         """All plants, in the order in which they came."""
-        return [self.plant(name) for name in self.plant_names()]
+        return [self.plant(name, with_sightings=with_sightings) for name in self.plant_names()]
 
     def sessions(self, plant: str | None = None) -> list[StoredSession]:
         """All sessions, of one plant or all, in the order in which they were added."""
