@@ -93,7 +93,7 @@ def test_flowers_follow_from_looks_as_from_all_at_once() -> None:
     frames, T, flower = _frames(40, 5, LASTING)
     by = looks(frames, T, flower, len(PLACES), LASTING)
     cov = rotate_cov(T[frames.frame, :3, :3], frames.covs)
-    W = np.linalg.inv(cov)
+    W = np.linalg.solve(cov, np.tile(np.eye(3), (len(cov), 1, 1)))
     n = len(by.flower)
     H, g = by.tied.copy(), np.zeros(3 * n)
     world = transform(T[frames.frame], frames.points)
@@ -101,10 +101,10 @@ def test_flowers_follow_from_looks_as_from_all_at_once() -> None:
         H[3 * a : 3 * a + 3, 3 * a : 3 * a + 3] += W[k]
         g[3 * a : 3 * a + 3] += W[k] @ world[k]
     found = by.mean @ np.linalg.solve(H, g)
-    claimed = by.mean @ np.linalg.inv(H) @ by.mean.T + by.left
+    claimed = by.mean @ np.linalg.solve(H, by.mean.T) + by.left
     expected, information = _at_once(by, frames, T, W, world)
     np.testing.assert_allclose(found, expected, atol=1e-6)
-    np.testing.assert_allclose(claimed, np.linalg.inv(information), rtol=2e-3, atol=1e-10)
+    np.testing.assert_allclose(claimed, np.linalg.solve(information, np.eye(len(information))), rtol=2e-3, atol=1e-10)
 
 
 def _at_once(by: Looks, frames: Frames, T: Array, W: Array, world: Array) -> tuple[Array, Array]:
@@ -118,7 +118,7 @@ def _at_once(by: Looks, frames: Frames, T: Array, W: Array, world: Array) -> tup
         R, share = T[frames.frame[k], :3, :3], 1.0 / np.sum(by.of == a)
         roots[a] += share * R @ LASTING.root(frames.points[k : k + 1])[0] @ R.T
         centres[a] += share * view[k]
-    C = np.linalg.inv(block)
+    C = np.linalg.solve(block, np.eye(3 * n))
     for a in range(n):
         for b in range(n):
             alike = 1.0 if by.flower[a] == by.flower[b] else COMMON
@@ -177,6 +177,5 @@ def test_covariances_are_true_where_errors_last(biased: tuple[Session, Truth]) -
     metrics = evaluate(result, session, truth)
     assert result.diagnostics.estimated_noise["flower_lasting_across"] == pytest.approx(0.0015, rel=0.3)
     assert metrics.nees_flowers is not None
-    assert (
-        0.5 < metrics.nees_flowers < 1.7
-    )  # of some fifty flowers, whose errors have the hand-eye transform's in common
+    # Of some fifty flowers, whose errors have the hand-eye transform's in common.
+    assert 0.5 < metrics.nees_flowers < 1.7

@@ -98,10 +98,9 @@ class Round:
 
         Between the distances at which a tree of as many clusters was last joined and would be joined next.
         """
-        n, c = len(label), int(label.max()) + 1
+        n, c = len(label), len(np.unique(label))
         if c == n:
             return 0.0
-        c = len(np.unique(label))
         low = float(self.tree[n - c - 1, 2])
         high = float(self.tree[n - c, 2]) if c > 1 else 2.0 * low
         return float(np.sqrt(low * high))
