@@ -10,6 +10,8 @@ import numpy as np
 
 from cluster_slam.association.frames import Frames, sort_by_frame
 from cluster_slam.config import SmoothConfig
+from cluster_slam.geometry import Array
+from cluster_slam.graph.batch import BatchSmoother, Estimate, Marginals
 from cluster_slam.graph.innovations import squared_innovations
 from cluster_slam.graph.noise import pose_model
 from cluster_slam.graph.poses import PoseModel
@@ -67,19 +69,18 @@ def smooth(
     noise_stated = world.noise
     clock.lap("landmarks")
     merged: list[tuple[int, int]] = []
-    if world.cov_step is None:  # where drift was followed, the association has been made with it
+    drifts = world.cov_step is not None
+    if not drifts:  # where drift was followed, the association has been made with it
         world, merged = _associate_and_smooth(stated, stated_poses, world, config, rng, say, clock)
-    if world.cov_step is None:
         world = drop_unsupported(stated, world, config)
     say("smoothing all", 0.85)
     frames, model = for_solving(stated, stated_poses, world)
     smoother, estimate = solve(frames, model, world, config, 4)
     before = world.landmark
-    if world.cov_step is None and not world.errs_slowly:
+    if not drifts and not world.errs_slowly:
         world = settle(frames, world, smoother, estimate)
     claimed, noise = world.landmark != before, world.noise
     world = let_all_stand(frames, learn(world, smoother, estimate), config)
-    drifts = world.cov_step is not None
     for i in range(config.max_rounds):
         grouped = world if drifts else regroup(frames, world, config, rng, claimed)
         if i > 0 and same_groups(world, grouped):
@@ -92,8 +93,23 @@ def smooth(
         frames, model = for_solving(stated, stated_poses, world)
         smoother, estimate = solve(frames, model, world, config, 2, in_stretches=True)
         world = learn(world, smoother, estimate)
+    world, smoother, estimate, marginals, nis = _conclude(stated, stated_poses, world, smoother, estimate, config)
+    marginals = with_unknown_scale(marginals, estimate, world.instruments, session.noise)
+    clock.lap("smoothing")
+    return make_result(session, frames, world, smoother, estimate, marginals, nis, config, seed, merged, clock.laps)
+
+
+def _conclude(
+    stated: Frames,
+    stated_poses: PoseModel,
+    world: World,
+    smoother: BatchSmoother,
+    estimate: Estimate,
+    config: SmoothConfig,
+) -> tuple[World, BatchSmoother, Estimate, Marginals, Array]:
+    """Errors that last, where there are any; the last step in GTSAM; how sure all is, and the squared innovations."""
     in_looks = None
-    if not drifts and not world.errs_slowly:
+    if world.cov_step is None and not world.errs_slowly:
         in_looks = solve_in_looks(stated, stated_poses, world, estimate, config)
     if in_looks is not None:
         smoother, estimate = in_looks.smoother, in_looks.estimate
@@ -103,9 +119,7 @@ def smooth(
     if in_looks is not None:
         estimate, marginals = in_looks.looks.flowers(estimate), in_looks.looks.flowers_marginals(marginals)
         world = replace(world, T=estimate.T, X=estimate.X, places=estimate.places, lasting=in_looks.lasting)
-    marginals = with_unknown_scale(marginals, estimate, world.instruments, session.noise)
-    clock.lap("smoothing")
-    return make_result(session, frames, world, smoother, estimate, marginals, nis, config, seed, merged, clock.laps)
+    return world, smoother, estimate, marginals, nis
 
 
 def _associate_and_smooth(
